@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Array, Floats, Ints
-from radarsdf.checks import MISSING_POSES, check, one_for_each_scan
+from radarsdf.checks import MISSING_POSES, check, one_for_each_scan, pose_matrices
 from radarsdf.imu import Imu
+from radarsdf.rig import Label, Rig
 
 _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
@@ -41,6 +44,8 @@ class Scan:
     """Time of the scan, s, by the clock of the file."""
     sigma: Array | None = None
     """(N, 3) the sensor's own standard deviations of range, azimuth and elevation of each return: m, rad, rad."""
+    sensor: Label | None = None
+    """Label of its radar, if there are several."""
 
     def __len__(self) -> int:
         """Number of returns."""
@@ -63,9 +68,14 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
         return scan
     what = "returns left out: a coordinate or the intensity is not a finite number"
     notes.count(what, int((~finite).sum()))
-    optional = (intensities, scan.doppler_mps, scan.sigma)
-    intensities, doppler_mps, sigma = (None if array is None else array[finite] for array in optional)
-    return Scan(points[finite], scan.T_world_sensor, intensities, doppler_mps, scan.time_s, sigma)
+    columns = {
+        "points": points,
+        "intensities": intensities,
+        "doppler_mps": scan.doppler_mps,
+        "sigma": scan.sigma,
+    }
+    kept: dict[str, Any] = {name: array[finite] for name, array in columns.items() if array is not None}
+    return dataclasses.replace(scan, **kept)
 
 
 class Notes:
@@ -110,6 +120,9 @@ class Scans:
     are iterated, so memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read all of them
     and cache them. `poses`, `times_s` and ``len()`` read the files once, and keep no points. The arguments of the constructor
     have the names, shapes and units of the properties.
+
+    Scans of several radars have `sensors`, the label of the radar of each. With their mountings, `T_body_sensor`, poses are
+    those of the body that carries them.
     """
 
     def __init__(
@@ -123,7 +136,10 @@ class Scans:
         times_s: Floats | None = None,
         sigmas: Sequence[Array] | None = None,
         imu: Imu | None = None,
+        sensors: Sequence[Label] | None = None,
+        T_body_sensor: Mapping[Any, ArrayLike] | None = None,
     ) -> None:
+        self._rig = Rig.of(sensors, T_body_sensor)
         self._arrays: dict[str, list[Array] | None] | None = {
             name: None if arrays is None else list(one_for_each_scan(arrays, name))
             for name, arrays in zip(_ARRAYS, (points, intensities, doppler_mps, sigmas), strict=True)
@@ -134,6 +150,7 @@ class Scans:
         self._notes = Notes()
         self._ground_truth: Callable[[], Array | None] = lambda: ground_truth
         self._imu: Callable[[], Imu | None] = lambda: imu
+        self._mountings: Callable[[], Mapping[Any, ArrayLike] | None] = lambda: T_body_sensor
 
     @classmethod
     def of_source(
@@ -142,16 +159,17 @@ class Scans:
         notes: Notes,
         ground_truth: Callable[[], Array | None] = lambda: None,
         imu: Callable[[], Imu | None] = lambda: None,
+        mountings: Callable[[], Mapping[Any, ArrayLike] | None] = lambda: None,
     ) -> Scans:
         """Build scans that are read lazily during iteration.
 
         `source` returns a new iterator over them, each with at least one return, and `notes` receive its assumptions. The
-        ground truth and the IMU are read once, on first access.
+        ground truth, the IMU and the `mountings` T_body_sensor of radars by label are read once, on first access.
         """
         scans = cls([], np.zeros((0, 4, 4)))
         scans._source, scans._notes = source, notes
         scans._arrays = scans._poses = None
-        scans._ground_truth, scans._imu = cache(ground_truth), cache(imu)
+        scans._ground_truth, scans._imu, scans._mountings = cache(ground_truth), cache(imu), mountings
         return scans
 
     def __iter__(self) -> Iterator[Scan]:
@@ -170,11 +188,33 @@ class Scans:
 
     @property
     def poses(self) -> Floats:
-        """(F, 4, 4) T_world_sensor, m."""
+        """(F, 4, 4) T_world_sensor, m; T_world_body if mountings are known."""
         self._read_once()
         if self._poses is None:
             raise ValueError(MISSING_POSES)
         return self._poses
+
+    @property
+    def sensor_poses(self) -> Floats:
+        """(F, 4, 4) T_world_sensor, m, of the radar of each scan."""
+        return self.poses if self.rig is None else self.rig.sensor_poses(pose_matrices(self.poses))
+
+    @property
+    def rig(self) -> Rig | None:
+        """Radars of the scans; None if there is one."""
+        self._read_once()
+        return self._rig
+
+    @property
+    def sensors(self) -> list[Label] | None:
+        """F labels of the radars of the scans; None if there is one radar."""
+        return None if self.rig is None else self.rig.sensors
+
+    @property
+    def T_body_sensor(self) -> dict[Label, Floats] | None:
+        """Mounting (4, 4) of each radar by its label, m; None if unknown."""
+        known = None if self.rig is None else self.rig.T_body_sensor
+        return None if self.rig is None or known is None else dict(zip(self.rig.labels, known, strict=True))
 
     @property
     def intensities(self) -> list[Array] | None:
@@ -220,10 +260,11 @@ class Scans:
         scans = self.with_poses(self.poses[frames])
         scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
         scans._times_s = None if self._times_s is None else self._times_s[frames]
+        scans._rig = None if self._rig is None else self._rig.select(frames)
         return scans
 
     def with_poses(self, poses: Floats, *, other_world: bool = False) -> Scans:
-        """Return the same scans with poses (F, 4, 4) float64 T_world_sensor, m. All scans are read.
+        """Return the same scans with other `poses` (F, 4, 4) float64, m. All scans are read.
 
         `other_world`: whether these are in another world frame than the ground truth, which is then dropped.
         """
@@ -244,21 +285,27 @@ class Scans:
         values = self._loaded().values()
         points, intensities, doppler_mps, sigma = (None if array is None else array[i] for array in values)
         time_s = None if self._times_s is None else float(self._times_s[i])
-        return Scan(np.asarray(points), self.poses[i], intensities, doppler_mps, time_s, sigma)
+        pose, rig, sensor = self.poses[i], self._rig, None
+        if rig is not None:
+            pose, sensor = rig.select([i]).sensor_poses(pose[None])[0], rig.labels[rig.of_scan[i]]
+        return Scan(np.asarray(points), pose, intensities, doppler_mps, time_s, sigma, sensor)
 
     def _read(self) -> Iterator[Scan]:
         """Read the files, and keep poses and times of a complete pass."""
         assert self._source is not None
         poses: list[Floats] = []
         times_s: list[float | None] = []
+        sensors: list[Label | None] = []
         self._notes.start_pass()
         for scan in self._source():
             poses.append(scan.T_world_sensor)
             times_s.append(scan.time_s)
+            sensors.append(scan.sensor)
             yield scan
         self._notes.end_pass()
         check(poses, f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}")
-        self._poses = np.stack(poses)
+        self._rig = None if None in sensors else Rig.of(sensors, self._mountings())
+        self._poses = np.stack(poses) if self._rig is None else self._rig.body_poses(np.stack(poses))
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
 
     def _read_once(self) -> None:
@@ -273,11 +320,12 @@ class Scans:
 
 
 def scans_in_memory(scans: Sequence[Scan]) -> Scans:
-    """Collect scans, with the arrays that all of them have."""
+    """Collect scans, with the arrays that all of them have. Their poses are T_world_sensor."""
     times_s = _all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
         times_s=None if times_s is None else np.array(times_s, np.float64),
+        sensors=_all_or_none([scan.sensor for scan in scans]),
         **_arrays_of(scans),
     )
 
@@ -290,7 +338,12 @@ def filled(points: Any, **given: Any) -> tuple[Any, ...]:
     return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
 
 
-def chosen(arrays: list[Array] | None, numbers: Ints | Sequence[int]) -> list[Array] | None:
+def rig_of(points: Any) -> Rig | None:
+    """Return the radars of `points`, if these are `Scans` of several."""
+    return points.rig if isinstance(points, Scans) else None
+
+
+def chosen(arrays: Sequence[Any] | None, numbers: Ints | Sequence[int]) -> list[Any] | None:
     """Arrays at these `numbers`, (K,), in this order; None for no arrays."""
     return None if arrays is None else [arrays[i] for i in numbers]
 

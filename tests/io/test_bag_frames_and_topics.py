@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from radarsdf.io import NoPoses, read
+from radarsdf.io import NoPoses, read, write_poses
 
 from ..conftest import pose
 
@@ -266,3 +266,63 @@ def test_arguments_of_bags_without_effect_are_refused(tmp_path):
             read(tmp_path / "a.bag", **options)
     with pytest.raises(ValueError, match="pose_topic would have no effect"):
         read(tmp_path / "a.bag", [np.eye(4)] * 3, pose_topic="/odom")
+
+
+LEVER = {("base", "front"): pose([2.0, 0, 0.5]), ("base", "rear"): pose([-1.0, 0.3, 0], np.pi)}
+
+
+def turning(time_s):
+    return pose([time_s - START_S, 0, 0], 0.5 * (time_s - START_S))
+
+
+def rig_bag(tmp_path, edges=LEVER, topics=("/front", "/rear"), frames=("front", "rear")):
+    def imu(bag):
+        for time_s in np.append(TIMES_S, TIMES_S[-1] + 0.1):
+            bag.write("/imu", bag.imu(time_s, [0, 0, 0.5], [0, 0, 9.81], "base"), time_s)
+
+    def odom(bag):
+        bag.write("/tf_static", bag.transforms(START_S, edges), START_S - 1)
+        for time_s in np.append(TIMES_S, TIMES_S[-1] + 0.1):
+            bag.write("/odom", bag.odometry(time_s, turning(time_s), child="base"), time_s)
+
+    parts = [odom, imu]
+    for i, (topic, frame) in enumerate(zip(topics, frames, strict=True)):
+        parts.append(lambda bag, i=i, t=topic, f=frame: clouds(bag, t, f, TIMES_S + 0.03 * i))
+    return bag_of(tmp_path, *parts)
+
+
+@pytest.mark.parametrize("topics", [("/front", "/rear"), ("/radar", "/radar")])
+def test_several_radars_are_labelled_and_mounted_on_the_body(tmp_path, topics):
+    """By their topics, or by their frames in one topic."""
+    scans = read(rig_bag(tmp_path, topics=topics), topic=list(dict.fromkeys(topics)))
+    front, rear = topics if topics[0] != topics[1] else ("front", "rear")
+    assert scans.sensors == [front, rear] * 10
+    assert_allclose([scans.T_body_sensor[front], scans.T_body_sensor[rear]], list(LEVER.values()), atol=1e-12)
+    assert_allclose(scans.poses, [turning(t) for t in scans.times_s], atol=1e-6)
+    assert_allclose(scans.sensor_poses[1], scans.poses[1] @ LEVER["base", "rear"], atol=1e-9)
+    assert_allclose([s.T_world_sensor for s in scans], scans.sensor_poses, atol=1e-9)
+    assert_allclose(scans.imu.R_sensor_imu, np.eye(3), atol=1e-12)  # of the body
+    assert any(note.startswith("mountings: TF, base -> ") for note in scans.notes)
+    # Poses that are given are those of the body, too: in order, or by time.
+    again = read(tmp_path / "drive", scans.poses, topic=list(dict.fromkeys(topics)))
+    assert_allclose(again.poses, scans.poses, atol=1e-12)
+    write_poses(tmp_path / "body.tum", scans.poses, scans.times_s)
+    by_time = read(tmp_path / "drive", tmp_path / "body.tum", topic=list(dict.fromkeys(topics)))
+    assert_allclose(by_time.sensor_poses, scans.sensor_poses, atol=1e-5)
+
+
+@pytest.mark.parametrize("edges", [{}, {("base", "front"): np.eye(4)}, "shared"])
+def test_without_all_mountings_radars_have_labels_and_their_own_poses(tmp_path, edges):
+    """Nor do topics tell them that share one frame."""
+    shared = edges == "shared"
+    bag = rig_bag(tmp_path, LEVER if shared else edges, frames=("front", "front" if shared else "rear"))
+    scans = read(bag, [pose([0.1 * i, 0, 0]) for i in range(20)], topic=["/front", "/rear"])
+    assert (scans.sensors, scans.T_body_sensor) == (["/front", "/rear"] * 10, None)
+    assert_allclose(scans.poses[:, 0, 3], 0.1 * np.arange(20))
+    assert any("no mountings are known" in note for note in scans.notes)
+
+
+def test_one_topic_of_one_frame_has_no_labels(tmp_path):
+    scans = read(rig_bag(tmp_path), topic="/front")
+    assert (scans.sensors, scans.T_body_sensor) == (None, None)
+    assert_allclose(scans.poses, [turning(t) @ LEVER["base", "front"] for t in TIMES_S], atol=1e-6)

@@ -207,6 +207,31 @@ def test_what_is_written_is_read(tmp_path, with_intensity):
     assert (part.intensities is None) == (not with_intensity)
 
 
+@pytest.mark.parametrize("mounted", [True, False])
+def test_radars_and_mountings_are_kept(tmp_path, mounted):
+    """Poses that are given are those of the body, as those of the file."""
+    mountings = {"rear": pose([-1, 0, 0], np.pi), "front": pose([2, 0, 1], 0.3)} if mounted else None
+    labels = ["front", "rear", "front"]
+    points = [np.full((2, 3), i + 1.0) for i in range(3)]
+    scans = Scans(points, POSES[:3], sensors=labels, T_body_sensor=mountings)
+    write_scans(tmp_path / "rig.npz", scans)
+    for again in (
+        read_scans(tmp_path / "rig.npz"),
+        read(tmp_path / "rig.npz"),
+        read(tmp_path / "rig.npz", POSES[:3]),
+    ):
+        assert (again.sensors, [scan.sensor for scan in again]) == (labels, labels)
+        assert_allclose(again.poses, POSES[:3], atol=1e-12)
+        assert_allclose(again.sensor_poses, scans.sensor_poses, atol=1e-12)
+        assert (again.T_body_sensor or {}).keys() == (mountings or {}).keys()
+    write_poses(tmp_path / "body.tum", POSES[:3], np.arange(3.0))
+    timed = Scans(points, POSES[:3], times_s=np.arange(3.0), sensors=labels, T_body_sensor=mountings)
+    write_scans(tmp_path / "rig.npz", timed)
+    assert_allclose(
+        read(tmp_path / "rig.npz", tmp_path / "body.tum").sensor_poses, scans.sensor_poses, atol=1e-6
+    )
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -218,6 +243,11 @@ def test_what_is_written_is_read(tmp_path, with_intensity):
         {"frame": np.array([0, 0, 0, 0, 0, 0.5])},
         {"frame": np.array(list("abcdef"))},
         {"points": np.array([{}] * 6, object)},
+        {"sensor": np.zeros(5, int)},
+        {"sensor": np.full(5, 2), "sensor_labels": np.array(["front", "rear"])},
+        {"sensor": np.zeros(5, int), "sensor_labels": np.arange(2)},
+        {"sensor": np.zeros(5, int), "sensor_labels": np.array(["a"]), "T_body_sensor": np.ones((1, 4, 4))},
+        {"T_body_sensor": np.eye(4)[None]},
     ],
     ids=str,
 )

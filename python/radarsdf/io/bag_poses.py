@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -119,6 +119,15 @@ class TransformTree:
         """T_base_sensor (4, 4) if the two frames are rigidly attached; None if they are not, or are unknown."""
         (top, T_top_base), (other, T_top_sensor) = self.rigid_top(base), self.rigid_top(sensor)
         return np.linalg.inv(T_top_base) @ T_top_sensor if top == other else None
+
+    def mountings(self, frames: Sequence[str]) -> tuple[str, dict[str, Floats]]:
+        """Return the highest frame rigidly attached to all known ones of `frames`, and T_top_frame of each; else the first, and none."""
+        known = {*self.tracks, *(track.parent for track in self.tracks.values())}
+        tops = {frame: self.rigid_top(frame) for frame in frames if frame in known}
+        names = {top for top, _ in tops.values()}
+        if len(names) != 1:
+            return frames[0], {}
+        return names.pop(), {frame: T_top_frame for frame, (_, T_top_frame) in tops.items()}
 
     def mounted_on(self, frame: str) -> str:
         """Return the highest frame that moves with this one, apart from changes of static transforms."""

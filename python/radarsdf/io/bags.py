@@ -9,20 +9,21 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.imu import Imu
 from radarsdf.io import bag_messages
 from radarsdf.io.bag_messages import Clock, Message, Topic, is_bag, read_messages, topics_with
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
 from radarsdf.io.poses import UNPOSED, NumberedPoses, Poses, poses_of
-from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
+from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, poses_on, scan_poses
 from radarsdf.scans import Scans
 
 # Topics of the radars in data sets, and of their poses. They take precedence over others.
@@ -51,21 +52,67 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         times_s = np.array([(cloud.stamp_s, cloud.recorded_s) for cloud in clouds]).T
         clocks[name] = Clock.of(times_s, name, request.stamps, request.notes)
 
+    poses = request.poses
+    in_bag = poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses)))
+    radars = _Radars.of(paths, scan_topics, frames, request, partly=in_bag)
+
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, clocks[topic.name], request) for topic in scan_topics]
         merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
-        return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
+        return streams[0] if radars is None else map(radars.labelled, merged)
 
-    poses = request.poses
-    if poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses))):
+    if in_bag:
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
         request.refuse("poses are given", "pose_topic", "world_frame")
-        find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
+        known = poses_of(poses, request.notes)
+        find = _user_poses(known, paths, scan_topics, frames, radars, raw_scans, request)
     imu_topic, recorded = _imu_topic(topics, request), clocks[scan_topics[0].name].recorded
-    imu = partial(_read_imu, paths, imu_topic, frames[0], recorded, request) if imu_topic else lambda: None
-    return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
+    body = frames[0] if radars is None else radars.body
+    imu = partial(_read_imu, paths, imu_topic, body, recorded, request) if imu_topic else lambda: None
+    mountings = (lambda: None) if radars is None else partial(radars.mountings, find)
+    return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu, mountings=mountings)
+
+
+@dataclass(frozen=True)
+class _Radars:
+    """Several radars of a bag, each with its own topic or frame."""
+
+    one_topic: bool
+    body: str  # frame to which all are attached, or else the most frequent one of the scans
+    mounted: dict[str, Floats]  # T_body_sensor (4, 4) by frame; empty if they are unknown
+    frames: dict[str, str] = field(default_factory=dict)  # by label, of the scans read so far
+
+    @classmethod
+    def of(
+        cls, paths: list[Path], topics: list[Topic], frames: list[str], request: Request, *, partly: bool
+    ) -> _Radars | None:
+        """Find the mountings in TF; `partly`: even if others are unknown. None if there are one topic and one frame."""
+        if len(topics) == len(frames) == 1:
+            return None
+        body, mounted = transforms_in(paths, request).mountings(frames)
+        # A frame that topics share does not tell where their radars are.
+        if len(frames) < len(topics) or (len(mounted) < len(frames) and not partly):
+            body, mounted = frames[0], {}
+        listed = ", ".join(mounted or frames)
+        words = f"mountings: TF, {body} -> {listed}" if mounted else f"no mountings are known of {listed}"
+        request.notes.add(f"{words}: poses are those of {body if mounted else 'each radar'}")
+        return cls(len(topics) == 1, body, mounted)
+
+    def labelled(self, raw: RawScan) -> RawScan:
+        """Label a scan by its topic or, of one topic, by its frame."""
+        label = raw.frame if self.one_topic else raw.topic
+        if self.frames.setdefault(label, raw.frame) != raw.frame:
+            label = f"{raw.topic} {raw.frame}"
+            self.frames[label] = raw.frame
+        return replace(raw, sensor=label, number=raw.number if self.one_topic else None)
+
+    def mountings(self, find: FindPoses) -> dict[str, Floats] | None:
+        """T_body_sensor by label, of the radars whose scans have poses; None unless all are known."""
+        frames = {label: frame for label, frame in self.frames.items() if find(frame) is not None}
+        known = {label: self.mounted[frame] for label, frame in frames.items() if frame in self.mounted}
+        return known if len(known) == len(frames) else None
 
 
 def _user_poses(
@@ -73,17 +120,24 @@ def _user_poses(
     paths: list[Path],
     topics: list[Topic],
     frames: list[str],
+    radars: _Radars | None,
     raw_scans: Callable[[], Iterator[RawScan]],
     request: Request,
 ) -> FindPoses:
-    """Poses passed by the user: in the order of the scans, or by time, of the most frequent frame among the first scans."""
+    """Poses passed by the user: in the order of the scans, or by time.
+
+    They are those of the body of several radars, or else of the most frequent frame among the first scans.
+    """
+    mounted = None if radars is None or request.extrinsic is not None else radars.mounted
     if isinstance(poses, (np.ndarray, NumberedPoses)):
         count = topics[0].num_messages if len(topics) == 1 else sum(1 for _ in raw_scans())
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
-        return lambda _: numbered_poses
+        of_frames = {frame: poses_on(numbered_poses, T) for frame, T in (mounted or {}).items()}
+        return of_frames.get if of_frames else lambda _: numbered_poses
     if poses is UNPOSED:
         return lambda _: poses
-    return transforms_in(paths, request).attach(poses, frames[0], request)
+    base = radars.body if radars is not None and mounted else frames[0]
+    return transforms_in(paths, request).attach(poses, base, request)
 
 
 def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:

@@ -25,7 +25,8 @@ _ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are accepted at any compressi
 _IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu's fields
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "points": ("N", 3), "frame": ("N",), "poses": ("F", 4, 4), "intensity": ("N",), "static": ("N",), "doppler": ("N",),
-    "times": ("F",), "sigma": ("N", 3), "lidar_points": ("M", 3), "ground_truth": ("M", 3),
+    "times": ("F",), "sigma": ("N", 3), "lidar_points": ("M", 3), "ground_truth": ("M", 3), "sensor": ("F",),
+    "sensor_labels": ("K",), "T_body_sensor": ("K", 4, 4),
 }  # fmt: skip
 TRUTH_ARRAYS = ("lidar_points", "ground_truth")  # the first of these that a file has is used
 
@@ -39,7 +40,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         An ``.npz`` file with these arrays:
 
         - ``points`` (N, 3): returns, sensor frame, m;
-        - ``poses`` (F, 4, 4): T_world_sensor, m;
+        - ``poses`` (F, 4, 4): T_world_sensor, m; T_world_body with ``T_body_sensor``;
         - ``frame`` (N,): row of ``poses`` for each return;
         - ``intensity`` (N,), optional: sensor units;
         - ``static`` (N,) bool, optional: only returns with True are used;
@@ -47,6 +48,8 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         - ``doppler`` (N,), optional: m/s;
         - ``times`` (F,), optional: time of each scan, s;
         - ``sigma`` (N, 3), optional: the sensor's own standard deviations of range, azimuth and elevation, m, rad, rad;
+        - ``sensor`` (F,), optional: row of ``sensor_labels`` (K,) str, the radars, for each scan; with their mountings
+          ``T_body_sensor`` (K, 4, 4), m, if known;
         - ``imu_times`` (G,), ``angular_velocity`` (G, 3), ``specific_force`` (G, 3), ``R_sensor_imu`` (3, 3), all optional: of
           :class:`radarsdf.io.Imu`.
 
@@ -79,6 +82,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     def by_scan(name: str) -> list[Array] | None:
         return [arrays[name][r] for r in rows] if name in arrays else None
 
+    labels, mountings = arrays.get("sensor_labels", np.zeros(0)).tolist(), arrays.get("T_body_sensor")
     return Scans(
         points=by_scan("points") or [],
         poses=arrays["poses"][frames].astype(np.float64),
@@ -88,20 +92,27 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
         sigmas=by_scan("sigma"),
         imu=imu,
+        sensors=[labels[i] for i in arrays["sensor"][frames].astype(int)] if "sensor" in arrays else None,
+        T_body_sensor=None if mountings is None else dict(zip(labels, mountings, strict=True)),
     )
 
 
 def _check_scans(arrays: Mapping[str, Array]) -> None:
-    known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
+    labels = arrays.get("sensor_labels", np.zeros(0))
+    known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1], "K": labels.shape[:1]}
     for name, array in arrays.items():
-        kinds = "biuf" if name == "static" else "iuf"
+        kinds = {"static": "biuf", "sensor_labels": "U"}.get(name, "iuf")
         check(array.dtype.kind in kinds, f"{name} must be real numbers, not {array.dtype}")
         first, *rest = _SHAPES.get(name, (None, *array.shape[1:]))
         expected = (*known.get(str(first), array.shape[:1]), *rest)
         check(array.shape == expected, f"{name} must have shape {expected}, not {array.shape}")
-    frame, num_poses = arrays["frame"], len(arrays["poses"])
-    rows = (frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)
-    check(rows.all(), f"frame must hold row indices of the {num_poses} poses")
+    _check_rows("frame", arrays["frame"], len(arrays["poses"]), "poses")
+    _check_rows("sensor", arrays.get("sensor", np.zeros(len(labels))), len(labels), "sensor_labels")
+
+
+def _check_rows(name: str, rows: Array, count: int, of: str) -> None:
+    fits = (rows == np.floor(rows)) & (rows >= 0) & (rows < count)
+    check(fits.all(), f"{name} must hold row indices of the {count} {of}")
 
 
 def write_scans(path: str | PathLike[str], scans: Scans) -> None:
@@ -129,6 +140,13 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     arrays = {name: np.concatenate(parts) for name, parts in named if parts is not None}
     arrays["frame"] = np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points])
     single = {"poses": scans.poses, "times": scans.times_s, "lidar_points": scans.ground_truth}
+    if (rig := scans.rig) is not None:
+        labels = [str(label) for label in rig.labels]
+        single |= {
+            "sensor": rig.of_scan,
+            "sensor_labels": np.array(labels),
+            "T_body_sensor": rig.T_body_sensor,
+        }
     if scans.imu is not None:
         single |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
     arrays |= {name: array for name, array in single.items() if array is not None}

@@ -66,13 +66,14 @@ def read(
         - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
-        (F, 4, 4) T_world_sensor, m, or a file: TUM, KITTI, 4 x 4 matrices, or a table that names its columns. By default
-        those of the data set, of the ``.npz``, of a file such as ``poses.txt`` in the folder, or of `pose_topic`.
+        (F, 4, 4) T_world_sensor, m, or T_world_body of several radars with mountings, or a file: TUM, KITTI, 4 x 4
+        matrices, or a table that names its columns. By default those of the data set, of the ``.npz``, of a file such as ``poses.txt`` in the folder, or of `pose_topic`.
         `radarsdf.io.UNPOSED` reads scans without poses; an ``.npz`` keeps its own.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are T_world_base.
     topic : str or sequence of str, optional
-        In a bag, the topics of the scans, merged by time. By default the radar's, if there is one.
+        In a bag, the topics of the scans, merged by time. By default the radar's, if there is one. Several topics, or
+        frames of one topic, are the labels of several radars. Static transforms give their mountings.
     pose_topic : str, optional
         In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one whose child frame is
         rigidly attached to that of the scans, else TF, else the only one.
@@ -191,19 +192,27 @@ def _npz(path: Path, request: recordings.Request) -> Scans:
     request.refuse(f"{path} has names of columns", "columns")
     scans = read_scans(path)
     if own := request.poses is None or request.poses is UNPOSED:
-        request.refuse(f"{path} contains its own poses T_world_sensor", "extrinsic")
+        request.refuse(f"{path} contains its own poses", "extrinsic")
         poses: Poses = rigid_or_nan(scans.poses, str(path), notes)
     else:
         poses = poses_of(request.poses, notes)
         notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
     times_s = None if scans.times_s is None else scans.times_s.tolist()
     matched, _ = recordings.scan_poses(poses, len(scans), times_s, request.extrinsic, request)
+    mountings = scans.T_body_sensor
     raw_scans = [
-        recordings.RawScan(partial(columns_of, s, s.points), s.time_s, f"{path}: scan {i}")
+        recordings.RawScan(
+            partial(columns_of, s, s.points),
+            s.time_s,
+            f"{path}: scan {i}",
+            str(s.sensor or ""),
+            sensor=s.sensor,
+        )
         for i, s in enumerate(scans)
     ]
     truth, imu = scans.ground_truth if own else None, scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    source = recordings.posed(lambda: raw_scans, lambda _: matched, request)
-    return Scans.of_source(source, notes, lambda: truth, lambda: imu)
+    of_radars = {label: recordings.poses_on(matched, T) for label, T in (mountings or {}).items()}
+    source = recordings.posed(lambda: raw_scans, lambda label: of_radars.get(label, matched), request)
+    return Scans.of_source(source, notes, lambda: truth, lambda: imu, lambda: mountings)

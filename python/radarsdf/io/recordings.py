@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -38,6 +38,7 @@ from radarsdf.io.poses import (
 )
 from radarsdf.io.text import in_seconds, read_numbers, read_table
 from radarsdf.io.units import scaled
+from radarsdf.rig import Label
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
 BASE_T_RADAR = "base_T_radar.txt"
@@ -94,6 +95,7 @@ class RawScan:
     frame: str = ""  # header frame; only in bags
     topic: str = ""  # topic name; only in bags
     number: int | None = None  # index of its pose. None: the number of scans before it
+    sensor: Label | None = None  # label of its radar, if there are several
 
 
 def posed(
@@ -124,7 +126,7 @@ def posed(
                 T_world_sensor = found
             num_posed += 1
             if scan := _scan(raw, T_world_sensor, layouts, request):
-                yield scan
+                yield replace(scan, sensor=raw.sensor)
         what = f"no scan has a pose: {unposed}, gaps up to {request.max_gap_s} s: do both use one clock?"
         check(num_posed or not unposed, f"{notes.about}: {what}")
 
@@ -174,11 +176,12 @@ def scan_poses(
         request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()
         poses = poses.poses(poses.times_s)
-    if T_base_sensor is None:
-        return poses, times_s
-    if isinstance(poses, np.ndarray):
-        return poses @ T_base_sensor, times_s
-    return TransformChain((poses, T_base_sensor)), times_s
+    return poses if T_base_sensor is None else poses_on(poses, T_base_sensor), times_s
+
+
+def poses_on(poses: StampedPoses | Floats, T_base_sensor: Floats) -> StampedPoses | Floats:
+    """Return T_world_sensor from poses T_world_base."""
+    return poses @ T_base_sensor if isinstance(poses, np.ndarray) else TransformChain((poses, T_base_sensor))
 
 
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:

@@ -1,6 +1,7 @@
 """Simulated radar scans of worlds whose true surface is known.
 
-`SCENES` holds the ready-made simulations by name. `simulate` scans your own `Scene` with a `RadarSensor`.
+`SCENES` holds the ready-made simulations by name. `simulate` scans your own `Scene` with a `RadarSensor`,
+`simulate_rig` with several radars on one body.
 
 Examples
 --------
@@ -13,12 +14,13 @@ Examples
 from .materials import Material
 from .motion import MeasuredMotion, drifted, measured_imu, measured_motion
 from .radar import Origin, RadarSensor, SimulatedScan
+from .rigs import MountedRadar, SimulatedRig, simulate_rig
 from .scenes import SCENES, astyx, hugin, oculii, wall
 from .simulation import Simulation, simulate
 from .world import Box, CornerReflector, Hits, Pole, Primitive, Scene, Terrain
 
 __all__ = [
-    "SCENES", "Box", "CornerReflector", "Hits", "Material", "MeasuredMotion", "Origin", "Pole",
-    "Primitive", "RadarSensor", "Scene", "SimulatedScan", "Simulation", "Terrain", "astyx", "drifted", "hugin",
-    "measured_imu", "measured_motion", "oculii", "simulate", "wall",
+    "SCENES", "Box", "CornerReflector", "Hits", "Material", "MeasuredMotion", "MountedRadar", "Origin", "Pole",
+    "Primitive", "RadarSensor", "Scene", "SimulatedRig", "SimulatedScan", "Simulation", "Terrain", "astyx", "drifted", "hugin",
+    "measured_imu", "measured_motion", "oculii", "simulate", "simulate_rig", "wall",
 ]  # fmt: skip

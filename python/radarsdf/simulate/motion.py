@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,13 +85,23 @@ def measured_motion(
     """
     poses = simulation.poses
     times_s = np.arange(len(poses), dtype=np.float64) / positive(rate_hz, "rate_hz")
-    positions, turning = _splines(poses, times_s)
+    positions, turning = splines(poses, times_s)
     in_sensor = np.einsum("fji,fj->fi", poses[:, :3, :3], positions(times_s, 1))
+    doppler_mps = measured_doppler(simulation.points, in_sensor, interval_mps, seed)
+    rng = generator(seed, _MOTION_STREAM, len(poses))
+    noise = _GYROSCOPE_SIGMA_RAD_S * rng.standard_normal((len(poses), 3))
+    return MeasuredMotion(times_s, doppler_mps, turning(times_s, 1) + gyroscope_bias_rad_s + noise)
+
+
+def measured_doppler(
+    points: Sequence[Floats32], velocities: Floats, interval_mps: float | None, seed: int
+) -> list[Floats32]:
+    """Measure the Doppler (N_i,), m/s, of F scans from the velocities (F, 3) of their sensors, m/s, sensor frame."""
     doppler_mps = []
-    for i, points in enumerate(simulation.points):
+    for i, scan in enumerate(points):
         rng = generator(seed, _MOTION_STREAM, i)
-        directions = points / np.linalg.norm(points, axis=1, keepdims=True)
-        speeds = -np.einsum("ni,i->n", directions, in_sensor[i])
+        directions = scan / np.linalg.norm(scan, axis=1, keepdims=True)
+        speeds = -np.einsum("ni,i->n", directions, velocities[i])
         speeds += _DOPPLER_SIGMA_MPS * rng.standard_normal(len(speeds))
         is_moving = rng.random(len(speeds)) < _MOVING_SHARE
         speeds += is_moving * _MOVING_SIGMA_MPS * rng.standard_normal(len(speeds))
@@ -98,9 +109,7 @@ def measured_motion(
             half = positive(interval_mps, "interval_mps") / 2
             speeds = (speeds + half) % (2 * half) - half
         doppler_mps.append(speeds.astype(np.float32))
-    rng = generator(seed, _MOTION_STREAM, len(poses))
-    noise = _GYROSCOPE_SIGMA_RAD_S * rng.standard_normal((len(poses), 3))
-    return MeasuredMotion(times_s, doppler_mps, turning(times_s, 1) + gyroscope_bias_rad_s + noise)
+    return doppler_mps
 
 
 def measured_imu(
@@ -150,7 +159,7 @@ def measured_imu(
     (2001, (2001, 3), True)
     """
     at_s: Floats = real_array(times_s, "times_s")
-    positions, turning = _splines(check_poses(poses), at_s)
+    positions, turning = splines(check_poses(poses), at_s)
     R_imu = np.eye(3) if R_sensor_imu is None else checked_rotation(R_sensor_imu)
     count = int(np.floor((at_s[-1] - at_s[0]) * positive(rate_hz, "rate_hz") + 1e-6)) + 1
     times = at_s[0] + np.arange(count) / rate_hz
@@ -167,7 +176,7 @@ def measured_imu(
     return Imu(times, rates, forces + _ACCELEROMETER_BIAS_MPS2 + noise)
 
 
-def _splines(poses: Floats, times_s: Floats) -> tuple[CubicSpline, RotationSpline]:
+def splines(poses: Floats, times_s: Floats) -> tuple[CubicSpline, RotationSpline]:
     """Splines of positions and rotations by time. Both raise a ValueError unless there are two poses, and ascending times."""
     rotations = Rotation.from_matrix(poses[:, :3, :3])
     return CubicSpline(times_s, poses[:, :3, 3]), RotationSpline(times_s, rotations)
