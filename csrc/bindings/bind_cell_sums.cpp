@@ -1,4 +1,5 @@
 #include <memory>
+#include <optional>
 
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
@@ -95,23 +96,28 @@ void bind_cell_sums(py::module_& m) {
   m.def(
       "sum_returns",
       [](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
-         const Array<std::int32_t>& cells, const Array<std::uint64_t>& keys, double leaf_size_m, int num_threads) {
+         const Array<std::int32_t>& cells, const Array<std::uint64_t>& keys, double leaf_size_m, int num_threads,
+         const std::optional<Array<std::int32_t>>& weights) {
         const std::int64_t num_cells = check_column(keys, "keys");
         const std::int64_t count = check_cells_of_returns(cells, num_cells);
         check_shape(cells, {check_rays(points, directions, ranges_m)}, "cells");
+        if (weights) check_shape(*weights, {count}, "weights");
         if (!(leaf_size_m > 0)) throw std::invalid_argument("leaf_size_m must be positive");
-        const ReturnsInCells returns{points.data(), directions.data(), ranges_m.data(), cells.data(), count};
+        const ReturnsInCells returns{points.data(),   directions.data(),
+                                     ranges_m.data(), cells.data(),
+                                     count,           weights ? weights->data() : nullptr};
         Array<std::int64_t> sums = new_array<std::int64_t>(num_cells, kSums);
         without_gil(
             [&] { sum_returns(returns, keys.data(), num_cells, leaf_size_m, sums.mutable_data(), num_threads); });
         return sums;
       },
       "points"_array, "directions"_array, "ranges_m"_array, "cells"_array, "keys"_array, "leaf_size_m"_a,
-      "num_threads"_a = 0,
+      "num_threads"_a = 0, "weights"_array = py::none(),
       "Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. "
       "Lengths are in quanta, QUANTA per leaf cell, positions relative to the corners of the leaf cells with Morton "
       "`keys` (C,) uint64; directions are multiplied by DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` "
-      "(N,) float32; `cells` (N,) int32, the row of each return's cell.");
+      "(N,) float32; `cells` (N,) int32, the row of each return's cell; "
+      "`weights` (N,) int32, with which the sums are multiplied, or None for 1.");
   m.attr("QUANTA") = kQuanta;
   const auto check_sums = [](const Array<std::uint64_t>& keys, const Array<std::int64_t>& sums) {
     const std::int64_t count = check_column(keys, "keys");

@@ -54,9 +54,10 @@ void bind_surface_crossings(py::module_& m) {
       [](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
          const Array<std::int32_t>& scans, const Array<double>& up_of_scan, const Array<std::int32_t>& planes,
          const Array<double>& centres, const Array<double>& normals, const Array<double>& variances_m2,
-         const VarianceNumbers& noise, const std::optional<Array<bool>>& kept, int num_threads) {
+         const Array<double>& noise, const std::optional<Array<bool>>& kept, int num_threads) {
         const std::int64_t count = check_rays(points, directions, ranges_m);
         const std::int64_t num_scans = check_points(up_of_scan, "up_of_scan");
+        check_shape(noise, {num_scans, 3}, "noise");
         const std::int64_t num_planes = check_column(variances_m2, "variances_m2");
         check_shape(centres, {num_planes, 3}, "centres");
         check_shape(normals, {num_planes, 3}, "normals");
@@ -70,19 +71,21 @@ void bind_surface_crossings(py::module_& m) {
         Array<float> new_points = new_array<float>(rows, 3), new_directions = new_array<float>(rows, 3),
                      new_ranges = new_array<float>(rows);
         const NoisyRays rays{points.data(), directions.data(), ranges_m.data(), scans.data(), planes.data(), k,
-                             count,         up_of_scan.data()};
+                             count,         up_of_scan.data(), noise.data()};
         const Planes all{centres.data(), normals.data(), variances_m2.data(), num_planes};
         const MovedRays moved{new_points.mutable_data(), new_directions.mutable_data(), new_ranges.mutable_data()};
-        without_gil([&] { move_onto_planes(rays, all, variances_of(noise), moved, num_threads); });
+        without_gil([&] { move_onto_planes(rays, all, moved, num_threads); });
         return py::make_tuple(new_points, new_directions, new_ranges);
       },
       "points"_array, "directions"_array, "ranges_m"_array, "scans"_array, "up_of_scan"_array, "planes"_array,
-      "centres"_array, "normals"_array, "variances_m2"_array, "noise"_a, "kept"_array = py::none(), "num_threads"_a = 0,
+      "centres"_array, "normals"_array, "variances_m2"_array, "noise"_array, "kept"_array = py::none(),
+      "num_threads"_a = 0,
       "Points, directions and ranges of the `kept` rays, (N,) bool or None for all, with returns shrunk towards their "
       "`planes` (N,) int32, -1 for none, by "
       "the share of their noise. Rays: `points`, `directions` (N, 3), `ranges_m` (N,) float32, `scans` (N,) int32; "
       "`up_of_scan` (F, 3) float64. Planes: `centres`, `normals` (P, 3), `variances_m2` (P,) of their returns, "
-      "float64. `noise`: variances along the beam, m^2, in azimuth and elevation, rad^2. Local frame, m.");
+      "float64. `noise` (F, 3) float64: variances along the beam, m^2, in azimuth and elevation, rad^2. Local frame, "
+      "m.");
 }
 
 }  // namespace radarsdf

@@ -189,8 +189,10 @@ void sum_returns(const ReturnsInCells& returns, const std::uint64_t* keys, std::
         corner[axis] = (std::int64_t{morton_coordinate(keys[cell], axis)} - kAxisBias) * kQuanta;
       std::uint64_t terms[kSums];
       sum_terms(returns.points + 3 * i, returns.directions + 3 * i, returns.ranges_m[i], corner, quanta, terms);
+      const auto weight = static_cast<std::uint64_t>(returns.weights == nullptr ? 1 : returns.weights[i]);
       std::int64_t* own = sums + kSums * cell;
-      for (int k = 0; k < kSums; ++k) own[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(own[k]) + terms[k]);
+      for (int k = 0; k < kSums; ++k)
+        own[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(own[k]) + weight * terms[k]);
     }
   });
 }

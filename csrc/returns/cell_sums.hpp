@@ -41,11 +41,12 @@ struct ReturnsInCells {
   const float* ranges_m;    // (count,)
   const std::int32_t* cells;
   std::int64_t count;
+  const std::int32_t* weights = nullptr;  // nullptr: all are 1
 };
 
-// sums: (num_cells, kSums), integer sums over the returns of each cell with Morton keys (num_cells), independent of
-// their order and exactly reversible. Lengths are in quanta, relative to the corners of the cells; directions in 1 /
-// kDirectionQuanta. Sums wrap around: those of products are invalid for a return far from its cell.
+// sums: (num_cells, kSums), integer weighted sums over the returns of each cell with Morton keys (num_cells),
+// independent of their order and exactly reversible. Lengths are in quanta, relative to the corners of the cells;
+// directions in 1 / kDirectionQuanta. Sums wrap around: those of products are invalid for a return far from its cell.
 void sum_returns(const ReturnsInCells& returns, const std::uint64_t* keys, std::int64_t num_cells, double leaf_size_m,
                  std::int64_t* sums, int num_threads);
 

@@ -22,8 +22,7 @@ struct alignas(64) Plane {
 
 }  // namespace
 
-void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnVariances& noise, const MovedRays& moved,
-                      int num_threads) {
+void move_onto_planes(const NoisyRays& rays, const Planes& planes, const MovedRays& moved, int num_threads) {
   LargeVector<Plane> own(planes.count);
   for (std::size_t p = 0; p < own.size(); ++p) {
     own[p].centre = vec3(planes.centres, p);
@@ -32,7 +31,8 @@ void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnV
   // Variance of a return's position along the plane's normal.
   const auto variance_m2 = [&](std::int64_t i, const Plane& plane) {
     return variance_along(plane.normal, vec3(rays.directions, i), rays.ranges_m[i],
-                          vec3(rays.up_of_scan, rays.scans[i]), noise);
+                          vec3(rays.up_of_scan, rays.scans[i]),
+                          variances_of(rays.noise_of_scan + 3 * std::int64_t{rays.scans[i]}));
   };
   const auto plane_of = [&](std::int64_t i) {
     prefetch(own.data() + std::max(rays.planes[std::min(i + kAhead, rays.count - 1)], 0));

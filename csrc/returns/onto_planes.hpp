@@ -16,7 +16,8 @@ struct NoisyRays {
   const std::int32_t* planes;  ///< (count), the plane of each return; -1: none, not moved
   const bool* kept;            ///< (count), rays to write; nullptr: all
   std::int64_t count;
-  const double* up_of_scan;  ///< (scans, 3), the z axis of the sensor
+  const double* up_of_scan;     ///< (scans, 3), the z axis of the sensor
+  const double* noise_of_scan;  ///< (scans, 3), variances along the beam, m^2, in azimuth and elevation, rad^2
 };
 
 struct Planes {
@@ -34,7 +35,6 @@ struct MovedRays {
 // A return keeps the share tau^2 / (tau^2 + sigma^2) of its distance from its plane: sigma^2 is the variance of its
 // noise across the plane, tau^2 that of all returns of the plane minus the mean of their sigma^2. Independent of the
 // number of threads.
-void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnVariances& noise, const MovedRays& moved,
-                      int num_threads);
+void move_onto_planes(const NoisyRays& rays, const Planes& planes, const MovedRays& moved, int num_threads);
 
 }  // namespace radarsdf

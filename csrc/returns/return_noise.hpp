@@ -17,7 +17,10 @@ struct ReturnVariances {
 // From the array of `SensorNoise.variances` in Python.
 using VarianceNumbers = std::array<double, 3>;
 
-inline ReturnVariances variances_of(const VarianceNumbers& numbers) { return {numbers[0], numbers[1], numbers[2]}; }
+template <typename Numbers>
+ReturnVariances variances_of(const Numbers& numbers) {
+  return {numbers[0], numbers[1], numbers[2]};
+}
 
 // Variance of a return's position along `normal`, at this direction and range from a sensor with z axis `up`.
 inline double variance_along(const Vec3& normal, const Vec3& direction, double range_m, const Vec3& up,

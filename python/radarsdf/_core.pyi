@@ -1188,9 +1188,7 @@ def move_onto_planes(
     centres: numpy.typing.NDArray[numpy.float64],
     normals: numpy.typing.NDArray[numpy.float64],
     variances_m2: numpy.typing.NDArray[numpy.float64],
-    noise: typing.Annotated[
-        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-    ],
+    noise: numpy.typing.NDArray[numpy.float64],
     kept: numpy.typing.NDArray[numpy.bool] | None = None,
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
 ) -> tuple[
@@ -1199,7 +1197,7 @@ def move_onto_planes(
     numpy.typing.NDArray[numpy.float32],
 ]:
     """
-    Points, directions and ranges of the `kept` rays, (N,) bool or None for all, with returns shrunk towards their `planes` (N,) int32, -1 for none, by the share of their noise. Rays: `points`, `directions` (N, 3), `ranges_m` (N,) float32, `scans` (N,) int32; `up_of_scan` (F, 3) float64. Planes: `centres`, `normals` (P, 3), `variances_m2` (P,) of their returns, float64. `noise`: variances along the beam, m^2, in azimuth and elevation, rad^2. Local frame, m.
+    Points, directions and ranges of the `kept` rays, (N,) bool or None for all, with returns shrunk towards their `planes` (N,) int32, -1 for none, by the share of their noise. Rays: `points`, `directions` (N, 3), `ranges_m` (N,) float32, `scans` (N,) int32; `up_of_scan` (F, 3) float64. Planes: `centres`, `normals` (P, 3), `variances_m2` (P,) of their returns, float64. `noise` (F, 3) float64: variances along the beam, m^2, in azimuth and elevation, rad^2. Local frame, m.
     """
 
 def num_threads(num_threads: typing.SupportsInt | typing.SupportsIndex = 0) -> int:
@@ -1309,9 +1307,10 @@ def sum_returns(
     keys: numpy.typing.NDArray[numpy.uint64],
     leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    weights: numpy.typing.NDArray[numpy.int32] | None = None,
 ) -> numpy.typing.NDArray[numpy.int64]:
     """
-    Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. Lengths are in quanta, QUANTA per leaf cell, positions relative to the corners of the leaf cells with Morton `keys` (C,) uint64; directions are multiplied by DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, the row of each return's cell.
+    Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. Lengths are in quanta, QUANTA per leaf cell, positions relative to the corners of the leaf cells with Morton `keys` (C,) uint64; directions are multiplied by DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, the row of each return's cell; `weights` (N,) int32, with which the sums are multiplied, or None for 1.
     """
 
 def vertex_areas(

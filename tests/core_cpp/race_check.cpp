@@ -274,7 +274,7 @@ void before_the_training(int threads, Results& results) {
 
   constexpr std::int64_t kPlanes = 300, kScans = 7;
   const auto planes = test::normal_numbers<double>(7 * kPlanes, 1.0, 19),
-             up = test::normal_numbers<double>(3 * kScans, 1.0, 20);
+             up = test::normal_numbers<double>(3 * kScans, 1.0, 20), noise = std::vector<double>(3 * kScans, 1e-4);
   const std::vector<float> ranges(kPoints, 6.0F);
   std::vector<std::int32_t> scans(kPoints), of_return(kPoints);
   for (std::int32_t i = 0; i < kPoints; ++i) {
@@ -283,8 +283,9 @@ void before_the_training(int threads, Results& results) {
   }
   std::vector<float> moved(7 * kPoints);
   radarsdf::move_onto_planes(
-      {points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), nullptr, kPoints, up.data()},
-      {planes.data(), planes.data() + 3 * kPlanes, planes.data() + 6 * kPlanes, kPlanes}, {0.01, 1e-4, 1e-4},
+      {points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), nullptr, kPoints, up.data(),
+       noise.data()},
+      {planes.data(), planes.data() + 3 * kPlanes, planes.data() + 6 * kPlanes, kPlanes},
       {moved.data(), moved.data() + 3 * kPoints, moved.data() + 6 * kPoints}, threads);
   results.add(moved.data(), 7 * kPoints);
 }

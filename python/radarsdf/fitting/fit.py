@@ -7,14 +7,15 @@ from os import PathLike
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import MISSING_POSES, instance
+from radarsdf.checks import MISSING_POSES, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.moving import StaticReturns
+from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import prepare
-from radarsdf.scans import Scans, filled
+from radarsdf.scans import Scans, filled, rig_of
 from radarsdf.threads import resolve_num_threads
 
 
@@ -38,7 +39,8 @@ def fit(
         (N_i, 3) each: the returns of one scan, sensor frame, m. :class:`radarsdf.io.Scans` supply poses, intensities and
         Doppler unless these are passed separately.
     poses : array_like, optional
-        (F, 4, 4) T_world_sensor, m, one for each scan. Required unless `points` are `Scans` with poses.
+        (F, 4, 4) T_world_sensor, m, one for each scan; of `Scans` with mountings, T_world_body. Required unless `points` are
+        `Scans` with poses.
     intensities : iterable of F arrays, optional
         (N_i,) each, sensor units. Without them the map has no reflectance. Outliers, such as -9999 in place of a
         measurement, are excluded from the reflectance; the surface keeps their returns. ``report["intensity_outliers"]``
@@ -58,7 +60,7 @@ def fit(
         Origin of the map's local frame, world, m. Default: the mean sensor position, rounded to the nearest block corner
         of ``config.lattice``. Fits with origins at block corners share their cells.
     intensity_range : (low, high), optional
-        Intensities scaled to 0 and 1, sensor units; others are clipped, except for outliers, which are left out. Default: the
+        Intensities scaled to 0 and 1, units of the first radar; others are clipped, except for outliers, which are left out. Default: the
         range of the intensities without outliers.
 
     Returns
@@ -98,12 +100,19 @@ def fit(
         scans, poses_, intensities_, doppler_mps_ = filled(points, **others)
         if poses_ is None:
             raise ValueError(MISSING_POSES)
-        static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns)
+        rig = rig_of(points)
+        if rig is not None:
+            poses_ = rig.sensor_poses(pose_matrices(poses_, len(rig.of_scan)))
+        static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns, rig)
         options = config.preparation | {"num_threads": resolve_num_threads(config.num_threads)}
-        rays = prepare(static.points, poses_, static.intensities, origin=origin, **options)
+        rays = prepare(static.points, poses_, static.intensities, origin=origin, rig=rig, **options)
+        radars = None
+        if rig is not None:
+            radars = Radars.of(rays, rig.labels, config, options["num_threads"])
+            rays = radars.in_one_unit(rays)
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
             scale = IntensityScale.between(intensity_range)
-        return FitInput(rays, scale, poses_, static.moving, static.why_none)
+        return FitInput(rays, scale, poses_, static.moving, static.why_none, radars=radars)
 
     return fit_rays(read, config, progress=progress, checkpoint=checkpoint)

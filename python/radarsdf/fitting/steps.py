@@ -30,6 +30,7 @@ from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
 from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.planes import Surfels
+from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import ScanSums
@@ -56,6 +57,7 @@ class FitInput:
     box_cells: Ints | None = None
     """(2, 3) box [lower, upper) of free-space crossings to store, leaf cells from the origin. None: no limit."""
     sums: ScanSums | None = None  # sums over the scans of the rays, if updated incrementally
+    radars: Radars | None = None  # of a rig. None: there is one, whose noise is estimated
     visibility: VisibilityCounts | None = None  # visibility counts, if updated incrementally
 
 
@@ -143,7 +145,8 @@ class _Fit:
         saved = None if path is None else Checkpoint(path, given.rays, given.scale, config)
         self._lap("prepare_s")
 
-        surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
+        noise = None if given.radars is None else given.radars.noise
+        surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums, noise)
         learnt = given.rays if given.inside is None else given.rays.select(given.inside)
         self._lap("ghosts_s")
 
@@ -188,8 +191,8 @@ def _contents(
     sensor, clutter_ratio, returns_per_cell = given.sensor, given.clutter_ratio, given.returns_per_cell
     if sensor is None:
         assert given.poses is not None
-        sensor = Sensor.of_rays(rays, given.poses, surface.noise)
-    noise, true, box_cells = surface.noise, surface.true, given.box_cells
+        sensor = Sensor.of_rays(rays, given.poses, surface.noise.mean)
+    noise, true, box_cells, radars = surface.noise, surface.true, given.box_cells, given.radars
 
     def free_space() -> FreeSpace:
         of_true = rays if true is None else rays.select(true)
@@ -214,6 +217,7 @@ def _contents(
         "clutter_ratio": surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
         "returns_per_cell": surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
         "sensor": sensor,
+        "sensors": {} if radars is None or given.poses is None else radars.sensors(rays, given.poses),
     }
 
 
@@ -239,7 +243,8 @@ def _report(
         "ghosts": len(learnt) - surface.count,
         "moving": given.moving,
         "intensity_outliers": outliers,
-        "noise": dataclasses.asdict(surface.noise),
+        "noise": dataclasses.asdict(surface.noise.mean),
+        **({} if given.radars is None else {"sensors": given.radars.report(given.rays)}),
         "leaf_cells": cells,
         "vertices": rows,
         "skipped": [words for words, _ in skipped],

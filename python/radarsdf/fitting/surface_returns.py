@@ -36,12 +36,15 @@ class SurfaceReturns:
         num_threads: int,
         inside: Bools | None = None,
         sums: ScanSums | None = None,
+        noise: SensorNoise | None = None,
     ) -> SurfaceReturns:
-        """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`: of the rays, if known."""
-        needed_later = config.returns.free_space or inside is not None
+        """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`, `noise`: of the rays, if known."""
+        needed_later = config.returns.free_space or inside is not None or noise is not None
         by_return = config.train or (config.returns.drop_ghosts and needed_later)
-        cells = _cells_of(rays, config, sums, by_return, num_threads)
-        noise = sensor_noise(cells.surfels, rays, config.returns, num_threads)
+        weights = None if noise is None else noise.weights(rays)
+        cells = _cells_of(rays, config, sums, by_return, num_threads, weights)
+        if noise is None:
+            noise = sensor_noise(cells.surfels, rays, config.returns, num_threads)
         clean = _returns_to_train if config.train else _returns_to_average
         return clean(rays, cells, noise, config, inside, num_threads)
 
@@ -53,12 +56,17 @@ class _Cells(NamedTuple):
 
 
 def _cells_of(
-    rays: Rays, config: FitConfig, sums: ScanSums | None, by_return: bool, num_threads: int
+    rays: Rays,
+    config: FitConfig,
+    sums: ScanSums | None,
+    by_return: bool,
+    num_threads: int,
+    weights: Ints32 | None,
 ) -> _Cells:
     leaves = None
     if sums is None:
         leaves = ReturnCells.of(rays, config.leaf_size_m, num_threads)
-        sums = ScanSums.of_cells(rays, leaves, config.leaf_size_m, num_threads)
+        sums = ScanSums.of_cells(rays, leaves, config.leaf_size_m, num_threads, weights)
     surfels, of_rays = Surfels.of_sums(sums, num_threads), None
     if by_return and leaves is not None:
         of_rays = surfels.cells_of_leaves(leaves.keys, num_threads)[leaves.cell_of_ray]
@@ -94,7 +102,7 @@ def _returns_to_average(
         of_ghosts = find_ghosts(surfels, means, cell_of_mean, noise, num_threads)
         means = means.select(~of_ghosts[cell_of_mean])
         true = None if cells.of_rays is None else ~of_ghosts[cells.of_rays]
-        count = int(surfels.counts[~of_ghosts].sum())
+        count = int(surfels.counts[~of_ghosts].sum() if true is None else np.count_nonzero(true))
     if inside is not None:
         count = int(np.count_nonzero(inside if true is None else true & inside))
         leaves = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +17,7 @@ from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatistics, ViewStatisticsAt
+from radarsdf.rig import Label
 from radarsdf.threads import resolve_num_threads
 
 _Part = TypeVar("_Part")
@@ -53,6 +55,7 @@ class MapContents(WholeMap):
     report: dict[str, Any]  # counts, losses, sensor noise and times of the fit, s
     free_space: Callable[[], FreeSpace] = FreeSpace.none  # free-space crossings, or none
     view_statistics: Callable[[], ViewStatistics] = ViewStatistics.none  # of intensity, or none
+    sensors: dict[Label, Sensor] = dataclasses.field(default_factory=dict)  # radars of a rig by label
 
     def views_in_world(self) -> ViewStatisticsAt:
         """Return the view statistics in the world frame, in sensor units."""

@@ -25,6 +25,7 @@ from radarsdf.map.threshold import VOXEL_M
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatisticsAt
+from radarsdf.rig import Label
 
 if TYPE_CHECKING:
     import trimesh
@@ -125,7 +126,14 @@ class Map(ABC):
         world, answer = _as_positions(x)
         return answer(confidence(self.contents_of_any, self.evidence_at(world)))
 
-    def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
+    def intensity(
+        self,
+        x: Any,
+        sensor_positions: Any,
+        *,
+        sensor: Sensor | Label | None = None,
+        extrapolate: bool = False,
+    ) -> Any:
         """Predict the intensity of the return that a sensor would measure at each position.
 
         Only views like those of the returns of the fit are predicted: from a range within a factor of 1.7, at an elevation
@@ -137,6 +145,8 @@ class Map(ABC):
             World, m.
         sensor_positions : (N, 3) or (3,) array_like or Tensor
             World, m.
+        sensor : Sensor or label, optional
+            The radar in whose unit intensities are. Default: the first of the fit.
         extrapolate : bool
             Whether to predict also where nothing was observed and for views unlike those of all returns, there with ranges
             clipped to those of the fit. Such values are meaningless.
@@ -150,13 +160,14 @@ class Map(ABC):
         Raises
         ------
         ValueError
-            If the map has no intensities.
+            If the map has no intensities, or no radar of this label.
         """
+        radar = self._radar(sensor)
         check(self.has_intensity, "this map was fitted without intensities")
         world, answer = _as_positions(x)
         sensors, _ = _as_positions(sensor_positions, rows=len(world))
         query = partial(queries.intensity, extrapolate=extrapolate)
-        return answer(self._evaluate(query, world, sensors, extrapolate=extrapolate))
+        return answer(radar.measured(self._evaluate(query, world, sensors, extrapolate=extrapolate)))
 
     def mesh(
         self,
@@ -236,7 +247,7 @@ class Map(ABC):
     def render(
         self,
         T_world_sensor: ArrayLike,
-        sensor: Sensor | None = None,
+        sensor: Sensor | Label | None = None,
         *,
         returns: float | None = None,
         noise: bool = False,
@@ -251,8 +262,8 @@ class Map(ABC):
         ----------
         T_world_sensor : (4, 4) array_like
             Pose of the sensor, m. Its frame: x forward, y left, z up.
-        sensor : Sensor, optional
-            The radar. Default: :attr:`sensor`, estimated from the scans of the fit.
+        sensor : Sensor or label, optional
+            The radar, or its label in :attr:`sensors`. Default: :attr:`sensor`, estimated from the scans of the fit.
         returns : float, optional
             Number of returns before those below the sensor's threshold are left out; at most one for each patch in view.
             Default: the sensor's number. More returns show more of the visible surface.
@@ -270,18 +281,27 @@ class Map(ABC):
         Raises
         ------
         ValueError
-            If the pose is not a rigid transform, or a number is out of range.
+            If the pose is not a rigid transform, a number is out of range, or the map has no radar of this label.
         TypeError
-            If `sensor` is not a :class:`Sensor`.
+            If `sensor` is neither a :class:`Sensor` nor a label of several radars.
         MemoryError
             If the view would need more memory than available. At most 10^6 beams are traced.
         """
         from radarsdf.map.view import view_from  # noqa: PLC0415 - trimesh is slow to import
 
         pose = check_pose(T_world_sensor, "T_world_sensor")
-        sensor = self.sensor if sensor is None else instance(sensor, Sensor, "sensor")
-        viewed = self._viewed_from(pose[:3, 3], sensor.range_m[1])
-        return view_from(viewed, pose, sensor, returns, noise=noise, seed=seed)
+        radar = self._radar(sensor)
+        viewed = self._viewed_from(pose[:3, 3], radar.range_m[1])
+        return view_from(viewed, pose, radar, returns, noise=noise, seed=seed)
+
+    def _radar(self, sensor: Sensor | Label | None) -> Sensor:
+        if sensor is None:
+            return self.sensor
+        if isinstance(sensor, Sensor) or not self.sensors:
+            return instance(sensor, Sensor, "sensor")
+        known = ", ".join(map(str, self.sensors))
+        check(sensor in self.sensors, f"the map has no radar {sensor!r:.50}; its radars are {known}")
+        return self.sensors[sensor]
 
     @abstractmethod
     def save(self, path: str | PathLike[str]) -> None:
@@ -302,8 +322,13 @@ class Map(ABC):
 
     @property
     def sensor(self) -> Sensor:
-        """The radar, estimated from the scans of the fit."""
+        """The radar, estimated from the scans of the fit; of several, all as one, with intensities in the unit of the first."""
         return self.contents_of_any.sensor
+
+    @property
+    def sensors(self) -> dict[Label, Sensor]:
+        """The radars of the fit by label, if there were several, each with its own noise and unit of intensities."""
+        return self.contents_of_any.sensors
 
     @property
     def intensity_scale(self) -> IntensityScale | None:

@@ -102,7 +102,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
             array = getattr(owner, name)
             stored = array.view(np.int64) if array.dtype == np.uint64 else array
             tensors[f"{part}.{name}"] = torch.from_numpy(stored)
-    description = {
+    description: dict[str, Any] = {
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
         "network_share": None if reflectance is None else reflectance.network_share,
@@ -112,6 +112,9 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "sensor": contents.sensor.to_dict(),
         "report": contents.report,
     }
+    if contents.sensors:  # labels may be of any type: JSON keeps numbers and text
+        named = ((k if isinstance(k, (int, str)) else str(k), own) for k, own in contents.sensors.items())
+        description["sensors"] = [[label, own.to_dict()] for label, own in named]
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
 
 
@@ -153,6 +156,7 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
         clutter_ratio=_in_range("clutter_ratio", description["clutter_ratio"], 1),
         returns_per_cell=_in_range("returns_per_cell", description["returns_per_cell"], math.inf),
         sensor=Sensor.from_dict(description["sensor"]),
+        sensors={label: Sensor.from_dict(own) for label, own in description.get("sensors", [])},
     )
 
 

@@ -158,7 +158,7 @@ def view_from(
     points = turned(surface.centres[chosen] - position, pose[:3, :3].T)
     intensities = None
     if surface.intensity is not None:
-        intensities = surface.intensity(surface.centres[chosen], position)
+        intensities = sensor.measured(surface.intensity(surface.centres[chosen], position))
         detected = ~(intensities < sensor.threshold(np.linalg.norm(points, axis=1)))
         points, intensities = points[detected], intensities[detected]
     if flag(noise, "noise"):

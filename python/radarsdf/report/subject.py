@@ -39,7 +39,7 @@ class Subject:
         """(3,) sensor position for predicted intensities: that of the middle scan, or the map's origin; world, m."""
         if self.scans is None:
             return self.radar_map.origin
-        return np.asarray(self.scans.poses[len(self.scans) // 2, :3, 3], np.float64)
+        return np.asarray(self.scans.sensor_poses[len(self.scans) // 2, :3, 3], np.float64)
 
     @cached_property
     def mesh(self) -> Any:

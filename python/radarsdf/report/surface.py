@@ -39,7 +39,7 @@ def surface_values(subject: Subject) -> dict[str, Any] | None:
         return None
     colors, legend = colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
     origin = subject.radar_map.origin
-    sensors = None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin
+    sensors = None if subject.scans is None else subject.scans.sensor_poses[:, :3, 3] - origin
     return {
         "scene": scene(np.asarray(mesh.vertices, np.float64) - origin, mesh.faces, colors, sensors),
         "sensors": sensors is not None,

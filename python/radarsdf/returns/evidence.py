@@ -13,7 +13,7 @@ from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sums import MeanRays, ReturnCells, merged_keys
+from radarsdf.returns.sums import WEIGHT_UNIT, MeanRays, ReturnCells, merged_keys
 
 CELLS_OF_SURFACE = 9
 """Approximate number of cells that a plane crosses in a 3 × 3 × 3 neighbourhood."""
@@ -85,7 +85,9 @@ class ReturnsOfCells:
     ) -> ReturnsOfCells:
         """Sum over all returns in each leaf cell."""
         cells = ReturnCells.of(rays, leaf_size_m, num_threads)
-        ones = np.broadcast_to(np.float32(1), len(rays))
+        parts = noise.weights(rays)
+        ones: Floats32 = np.broadcast_to(np.float32(1), len(rays))
+        ones = ones if parts is None else (parts / WEIGHT_UNIT).astype(np.float32)
         weights, information = (
             np.bincount(cells.cell_of_ray, values, len(cells.keys)).astype(np.float32)
             for values in weights_of(ones, rays.ranges_m, noise)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf._core import find_free_space
-from radarsdf.arrays import Bools, Bytes, Ints, Keys
+from radarsdf.arrays import Bools, Bytes, Floats32, Ints, Keys
 from radarsdf.checks import check
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
@@ -44,13 +44,16 @@ class FreeSpace:
         num_threads: int = 0,
     ) -> FreeSpace:
         """Compute the crossings of `rays` to true returns in the box [lower, upper), (2, 3) leaf cells; None for no limit."""
+
         # Rays end two standard deviations before the return, and where the angular error exceeds one cell: beyond
         # that, the crossed cell is uncertain.
-        before_m = rays.ranges_m - np.float32(_SIGMAS) * np.sqrt(noise.variances_m2(rays.ranges_m))
-        known_m = np.float32(leaf_size_m / noise.angle_rad)
+        def end_m(own: SensorNoise, ranges_m: Floats32) -> Floats32:
+            before_m = ranges_m - np.float32(_SIGMAS) * np.sqrt(own.variances_m2(ranges_m))
+            return np.minimum(before_m, np.float32(leaf_size_m / own.angle_rad))
+
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
         lower, upper = limit if box_cells is None else box_cells.tolist()
-        crossed_m, scans = np.minimum(before_m, known_m), np.ascontiguousarray(rays.scans)
+        crossed_m, scans = noise.of_returns(rays, end_m), np.ascontiguousarray(rays.scans)
         box = leaf_size_m, lower, upper
         return cls(*find_free_space(*rays.in_c_order(), crossed_m, scans, *box, num_threads))
 

@@ -19,6 +19,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.products import normal_matrix, product
 from radarsdf.returns.rays import Rays, check_scans, prepare
+from radarsdf.rig import Rig
 from radarsdf.scans import Scans
 
 MIN_DOPPLER_RETURNS = 10
@@ -198,6 +199,21 @@ class MovingReturns:
             return cls(none, f"{share:.0%} of the returns disagree with the sensor's own motion")
         return cls(masks, None)
 
+    @classmethod
+    def of_radars(
+        cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike], rig: Rig | None
+    ) -> MovingReturns:
+        """:meth:`of` for each radar: they differ in the sign of the Doppler and in its ambiguity interval."""
+        if rig is None:
+            return cls.of(points, doppler_mps)
+        masks, why = [np.zeros(0, bool)] * len(rig.of_scan), list[str]()
+        for rows in rig.scans_of_radars():
+            own = cls.of([points[i] for i in rows], [doppler_mps[i] for i in rows])
+            why += [] if own.why_none is None else [f"{rig.labels[rig.of_scan[rows[0]]]}: {own.why_none}"]
+            for i, mask in zip(rows.tolist(), own.masks, strict=True):
+                masks[i] = mask
+        return cls(masks, "; ".join(why) or None)
+
     @property
     def count(self) -> int:
         return sum(int(mask.sum()) for mask in self.masks)
@@ -222,6 +238,7 @@ class StaticReturns:
         intensities: Iterable[ArrayLike] | None,
         doppler_mps: Sequence[ArrayLike] | None,
         config: ReturnsConfig,
+        rig: Rig | None = None,
     ) -> StaticReturns:
         """Drop moving returns, see :meth:`MovingReturns.of`; keep all without Doppler or ``config.drop_moving``."""
         if doppler_mps is None or not config.drop_moving:
@@ -229,7 +246,7 @@ class StaticReturns:
         points = list(one_for_each_scan(points, "points"))
         intensities = None if intensities is None else list(one_for_each_scan(intensities, "intensities"))
         check_scans(points, intensities)
-        moving = MovingReturns.of(points, doppler_mps)
+        moving = MovingReturns.of_radars(points, doppler_mps, rig)
         values = None if intensities is None else moving.without(intensities)
         return cls(moving.without(points), values, moving.count, moving.why_none)
 
@@ -246,6 +263,6 @@ def checked_doppler(scans: list[Array], doppler_mps: Sequence[ArrayLike]) -> lis
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
     """Return rays of the static returns within the ranges of a fit, without accumulating scans. Intensity outliers are NaN."""
-    static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
+    static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns, scans.rig)
     options = config.preparation | {"accumulate_scans": 1, "lattice": None}
-    return prepare(static.points, scans.poses, static.intensities, **options)
+    return prepare(static.points, scans.sensor_poses, static.intensities, rig=scans.rig, **options)

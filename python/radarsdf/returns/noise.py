@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -14,6 +14,7 @@ from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.sums import WEIGHT_UNIT
 
 _Ranges = TypeVar("_Ranges", Floats32, Floats)
 
@@ -29,6 +30,7 @@ _TRUNCATION = 1.05
 _ROUNDS = 10
 _SETTLED = 0.01  # relative change of the variances at convergence. The sampling error is larger
 _FIRST_ANGLE_RAD = 0.01
+_LEAST_VARIANCE = 1e-30  # m² or rad², against division by zero
 _MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, against division by zero
 
 
@@ -45,14 +47,24 @@ class SensorNoise:
         return cls(*np.median([dataclasses.astuple(noise) for noise in noises], axis=0).tolist())
 
     @property
+    def deviations(self) -> list[float]:
+        """Standard deviations along the beam, m, in azimuth and in elevation, rad."""
+        return [self.range_m, self.azimuth_rad, self.elevation_rad]
+
+    @property
     def variances(self) -> list[float]:
         """Variances along the beam, m², in azimuth and in elevation, rad²."""
-        return np.square(dataclasses.astuple(self)).tolist()
+        return np.square(self.deviations).tolist()
+
+    @property
+    def mean(self) -> SensorNoise:
+        """The same as the noise of one radar."""
+        return SensorNoise(*self.deviations)
 
     @property
     def settings(self) -> dict[str, float]:
         """Settings of ``config.returns`` with which a fit does not estimate the noise."""
-        return dict(zip(NOISE_SETTINGS, dataclasses.astuple(self), strict=True))
+        return dict(zip(NOISE_SETTINGS, self.deviations, strict=True))
 
     @property
     def angle_rad(self) -> float:
@@ -67,8 +79,67 @@ class SensorNoise:
         """Return the mean (N,) of the variances along the three axes at ranges (N,), m²."""
         return self.variances_m2(ranges_m.astype(np.float64), axes_across=2) / 3
 
+    def weights(self, rays: Rays) -> Ints32 | None:  # noqa: ARG002 - of one radar
+        """Return the weight (N,) of each return in parts of 1 / `WEIGHT_UNIT`, relative to the mean of all. None: all equal."""
+        return None
 
-def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> SensorNoise:
+    def of_scans(self, rays: Rays) -> Floats:
+        """Return :attr:`variances` (F, 3) of the returns of each scan."""
+        return np.tile(self.variances, (len(rays.up_of_scan), 1))
+
+    def of_returns(self, rays: Rays, function: Callable[[SensorNoise, Floats32], Floats32]) -> Floats32:
+        """Return function(noise of the radar, ranges) of each return, (N,)."""
+        return function(self, rays.ranges_m)
+
+
+@dataclass(frozen=True)
+class RigNoise(SensorNoise):
+    """Noise of several radars. Its own variances are harmonic means over all returns: their information is the mean."""
+
+    of_sensors: tuple[SensorNoise, ...]  # of each of K radars
+    parts: tuple[int, ...]
+    """Weight of a return of each radar, in parts of 1 / `WEIGHT_UNIT`. The mean over all returns is 1."""
+
+    @classmethod
+    def of(cls, of_sensors: Sequence[SensorNoise], rays: Rays) -> RigNoise:
+        """Build from the noise of each radar. A return's weight is the mean information of the returns of its radar."""
+        ranges_m = [rays.ranges_m[rows].astype(np.float64) for rows in rays.rows_of_sensors()]
+        counts = np.array([len(own) for own in ranges_m])
+        variances = np.maximum([own.variances for own in of_sensors], _LEAST_VARIANCE)
+        mean = SensorNoise(*np.sqrt(counts.sum() / (counts / variances.T).sum(axis=1)).tolist())
+        of_each = zip(of_sensors, ranges_m, strict=True)
+        weights = np.array([np.sum(mean.variances_m2(r) / own.variances_m2(r)) for own, r in of_each])
+        weights *= counts.sum() / weights.sum() / np.maximum(counts, 1)
+        parts = np.maximum(np.rint(WEIGHT_UNIT * weights), 1).astype(int).tolist()
+        return cls(mean.range_m, mean.azimuth_rad, mean.elevation_rad, tuple(of_sensors), tuple(parts))
+
+    def weights(self, rays: Rays) -> Ints32 | None:
+        return np.array(self.parts, np.int32)[rays.sensor_of_scan][rays.scans]
+
+    def of_scans(self, rays: Rays) -> Floats:
+        return np.array([own.variances for own in self.of_sensors])[rays.sensor_of_scan]
+
+    def of_returns(self, rays: Rays, function: Callable[[SensorNoise, Floats32], Floats32]) -> Floats32:
+        found = np.empty(len(rays), np.float32)
+        for own, rows in zip(self.of_sensors, rays.rows_of_sensors(), strict=True):
+            found[rows] = function(own, rays.ranges_m[rows])
+        return found
+
+
+def rig_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> RigNoise:
+    """Estimate the noise of each radar from its own returns. With too few on flat surfels, it is that of all radars."""
+    mean = sensor_noise(surfels, rays, config, num_threads)
+    own = map(rays.select, rays.rows_of_sensors())
+    return RigNoise.of([sensor_noise(surfels, part, config, num_threads, mean) for part in own], rays)
+
+
+def sensor_noise(
+    surfels: Surfels,
+    rays: Rays,
+    config: ReturnsConfig,
+    num_threads: int = 0,
+    initial: SensorNoise | None = None,
+) -> SensorNoise:
     """Estimate the noise of the sensor from the distances of returns to their surfels.
 
     The variance across a plane is the sum of the three variances, each weighted by the squared component of the
@@ -80,7 +151,8 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
     """
     known = np.array([getattr(config, name) for name in NOISE_SETTINGS], np.float64)
     free = np.isnan(known)
-    sigma2 = np.where(free, [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD], known) ** 2
+    guess = [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD]
+    sigma2 = np.where(free, guess if initial is None else initial.deviations, known) ** 2
     on_flat = surfels.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
     tried = min(len(rays), int(_RETURNS * len(rays) / max(on_flat, 1.0)))
     rows = np.linspace(0, len(rays) - 1, tried).astype(np.int64)
@@ -161,7 +233,7 @@ def onto_surfels(
         surfels.centres,
         surfels.normals,
         np.ascontiguousarray(surfels.variances[:, 0]),
-        noise.variances,
+        noise.of_scans(rays),
         kept,
         num_threads,
     )

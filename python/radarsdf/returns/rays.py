@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import hash_rays, scan_rays
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints32, Keys
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Keys
 from radarsdf.checks import (
     MAX_POSITION_M,
     check,
@@ -26,6 +26,7 @@ from radarsdf.checks import (
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
+from radarsdf.rig import Rig
 
 _LOG = logging.getLogger("radarsdf.returns")
 _COLUMNS = ("points", "directions", "ranges_m", "intensities", "scans")
@@ -54,6 +55,9 @@ class Rays:
     scans: Ints32  # (N,) scan of each return
     up_of_scan: Floats  # (F, 3) z axis of the sensor in each scan, local frame
     num_given: int  # number of returns in the scans, including those out of range
+    # (F,) row of the radar of each scan in its :class:`Rig`. None: there is one
+    sensor_of_scan: Ints32 | None = None
+    num_sensors: int = 1
 
     def __len__(self) -> int:
         return len(self.points)
@@ -65,6 +69,13 @@ class Rays:
             return np.zeros(len(self), np.bool_)
         return ~np.isnan(self.intensities)
 
+    def rows_of_sensors(self) -> list[slice | Ints]:
+        """Return the rows of the returns of each radar."""
+        if self.sensor_of_scan is None:
+            return [slice(None)]
+        sensors = self.sensor_of_scan.take(self.scans)
+        return [np.flatnonzero(sensors == i) for i in range(self.num_sensors)]
+
     def hashes(self, num_threads: int = 0) -> Keys:
         """Return keys (N,) for samples that do not depend on the order of scans, nor on the origin."""
         intensities = None if self.intensities is None else np.ascontiguousarray(self.intensities)
@@ -75,7 +86,9 @@ class Rays:
         """Replace intensity outliers by NaN."""
         if self.intensities is None:
             return self
-        kept = Plausible.of(self.intensities, self.hashes()).kept(self.intensities)
+        kept, keys = self.intensities.copy(), self.hashes()
+        for own in self.rows_of_sensors():  # each radar has its own unit
+            kept[own] = Plausible.of(kept[own], keys[own]).kept(kept[own])
         return dataclasses.replace(self, intensities=kept)
 
     def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> Rays:
@@ -218,11 +231,13 @@ def prepare(
     origin: ArrayLike | None = None,
     lattice: WorldLattice | None = None,
     whole: bool = True,
+    rig: Rig | None = None,
     num_threads: int = 1,
 ) -> Rays:
     """Check scans and convert them to rays in the local frame.
 
     `points`, `intensities`: F arrays (N_i, 3), sensor frame, m, and (N_i,), sensor units; `poses` (F, 4, 4) T_world_sensor, m.
+    `rig`: the radars of the scans, if there are several.
     The default `origin` is the mean sensor position, rounded to the nearest block corner of the `lattice`, so that maps of
     different scans share their cells. `whole` False: the scans are a part of a set, which need not have returns within the
     ranges, and intensity outliers are not replaced by NaN.
@@ -231,6 +246,8 @@ def prepare(
     of the logger ``radarsdf.returns``. Raises a ValueError if lengths or shapes do not match, half of the poses or more are
     not rigid, intensities are all equal or too far apart for float32, or no return is within the ranges.
     """
+    mixed = rig is not None and len(rig.labels) > 1 and accumulate_scans > 1
+    check(not mixed, f"accumulate_scans must be 1 for several radars, not {accumulate_scans}")
     scans, values, left_out = check_scans(points, intensities)
     num_scans = len(scans)
     T_world_sensor, rigid = usable_poses(poses, num_scans)
@@ -265,6 +282,8 @@ def prepare(
         scans=scan_of[kept],
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
         num_given=left_out.given,
+        sensor_of_scan=None if rig is None else rig.of_scan,
+        num_sensors=1 if rig is None else len(rig.labels),
     )
     rays = rays.without_outliers() if whole else rays
     if rays.intensities is not None and whole:

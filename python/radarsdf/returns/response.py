@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints32
+from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.products import normal_matrix, product
 
 # A return lies on no known surface, on a level one or on a steep one. The ground is of another material than walls and
@@ -65,7 +65,7 @@ class Response:
         chosen, y = kinds[some], values[some].astype(np.float64)
         rays = _of_ray(directions[some], ranges_m[some]).astype(np.float64)
         coefficients = np.zeros((NUM_KINDS, NUM_COEFFICIENTS))
-        coefficients[:, :_BASE] = _regression(rays, y)
+        coefficients[:, :_BASE] = regression(rays, y)
         left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
         table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
         table[~_near(_bins(_log_range(ranges_m), directions[:, 2]))] += _UNMEASURED
@@ -74,7 +74,7 @@ class Response:
             if np.count_nonzero(own) >= _FEWEST:
                 of_incidence = _of_incidence(incidence_rad[some][own].astype(np.float64))
                 # Both have a column of ones: the ridge makes the system regular.
-                coefficients[kind] = _regression(np.concatenate([rays[own], of_incidence], axis=1), y[own])
+                coefficients[kind] = regression(np.concatenate([rays[own], of_incidence], axis=1), y[own])
         return cls(coefficients, table.astype(np.float32))
 
     @np.errstate(under="ignore")
@@ -105,7 +105,7 @@ class Response:
         return (self.table > _HALF / 2).ravel()[_bins(_log_range(ranges_m), directions[:, 2])]
 
 
-def kinds_of(normals: Floats32, plane: Ints32) -> NDArray[np.int8]:
+def kinds_of(normals: Floats32, plane: Ints | Ints32) -> NDArray[np.int8]:
     """Return the kind of surface (N,) of each return from the row `plane` (N,) of its normal in `normals` (P, 3); -1: none."""
     # The last entry serves row -1.
     of_plane = np.full(len(normals) + 1, NO_SURFACE, np.int8)
@@ -139,6 +139,14 @@ def _log_range(ranges_m: Floats32) -> Floats32:
     return np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
 
 
+def of_views(directions: Floats32, ranges_m: Floats32, normals: Floats, plane: Ints) -> Floats:
+    """Return columns (N, 24): those of a regression on range, elevation and incidence on planes (N,) of each kind of surface."""
+    incidence = np.arccos(np.minimum(np.abs(np.einsum("ni,ni->n", normals[plane], directions)), 1.0))
+    of_view = np.concatenate([_of_ray(directions, ranges_m)[:, 1:], _of_incidence(incidence)[:, 1:]], axis=1)
+    kinds = kinds_of(normals.astype(np.float32), plane)[:, None]
+    return np.concatenate([np.where(kinds == kind, of_view, 0.0) for kind in (LEVEL, STEEP)], axis=1)
+
+
 def _bins(log_range: AnyFloats, up: AnyFloats) -> Ints32:
     """Return the bin (N,) of the table for each log10(range / 10 m) and sine of the elevation."""
     rows, columns = TABLE_SHAPE
@@ -150,7 +158,7 @@ def _bins(log_range: AnyFloats, up: AnyFloats) -> Ints32:
     return row * np.int32(columns) + column
 
 
-def _regression(design: Floats, values: Floats) -> Floats:
+def regression(design: Floats, values: Floats) -> Floats:
     """Fit coefficients by iteratively reweighted least squares, approximately minimising the absolute error."""
     weights = np.ones(len(values))
     ridge = np.eye(design.shape[1]) * (1e-3 * np.sqrt(len(values)) + 1e-6 * float((design**2).sum()))

@@ -7,12 +7,12 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Array, Floats
+from radarsdf.arrays import Array, Floats, Floats32
 from radarsdf.checks import check, not_negative, number, usable_poses
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays, prepare
@@ -25,6 +25,7 @@ _RANGE_BINS = 8
 _WEAKEST = 0.01  # quantile of the intensities in a range bin that is the threshold there
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))  # of a normal distribution, standard deviations
 _MAX_RANGE_M = 1e6
+_Intensities = TypeVar("_Intensities", Floats, Floats32)
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Sensor:
     thresholds: tuple[tuple[float, float], ...] = ()
     """Pairs of a range, m, ascending, and the weakest intensity detected there, sensor units, interpolated
     linearly. Empty: the sensor measures no intensities."""
+    unit: tuple[float, float] = (1.0, 0.0)
+    """Gain and offset: it measures gain · intensity + offset where the map, in the unit of its first radar, has an intensity."""
 
     def __post_init__(self) -> None:
         limits = {"azimuth_rad": math.pi, "elevation_rad": math.pi / 2, "range_m": _MAX_RANGE_M}
@@ -70,6 +73,8 @@ class Sensor:
         fits = not any(a >= b for (a, _), (b, _) in itertools.pairwise(steps))
         check(fits, "thresholds must have ascending ranges")
         object.__setattr__(self, "thresholds", steps)
+        check(_pair(self.unit, "unit")[0] > 0, f"the gain of unit must be positive, not {self.unit[0]}")
+        object.__setattr__(self, "unit", _pair(self.unit, "unit"))
 
     @property
     def beam_rad(self) -> tuple[float, float]:
@@ -86,6 +91,11 @@ class Sensor:
         at_m, weakest = np.transpose(self.thresholds)
         return np.interp(ranges_m, at_m, weakest)
 
+    def measured(self, intensities: _Intensities) -> _Intensities:
+        """Convert intensities (N,) of a map to the :attr:`unit` of this sensor."""
+        gain, offset = self.unit
+        return intensities if self.unit == (1.0, 0.0) else gain * intensities + offset
+
     def directions(self, azimuth_rad: Array, elevation_rad: Array) -> Floats:
         """Convert azimuths and elevations (N,), rad, to unit vectors (N, 3), float64, in the sensor frame."""
         x, y = np.cos(azimuth_rad), np.sin(azimuth_rad)
@@ -94,7 +104,9 @@ class Sensor:
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict that JSON can store. :meth:`from_dict` is the inverse."""
-        return dataclasses.asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
+        described = dataclasses.asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
+        unit = described.pop("unit")
+        return described if unit == (1.0, 0.0) else described | {"unit": list(unit)}
 
     @classmethod
     def from_dict(cls, described: dict[str, Any]) -> Sensor:

@@ -14,6 +14,8 @@ from radarsdf.returns.rays import Rays
 MAX_CELLS_FROM_ORIGIN = 1_000_000
 """Farthest cell along each axis. A Morton key has 21 bits for each axis."""
 
+WEIGHT_UNIT = 64
+"""Parts of a weight of 1. Sums of integers do not depend on their order; a power of two divides them exactly."""
 _AXIS_BITS = 21  # bits of a key for each axis, interleaved
 _QUARTER = np.uint64(0b111 << (3 * (_AXIS_BITS - 2)))  # second highest bit of each axis
 _COMPACTED = (
@@ -84,27 +86,39 @@ class ScanSums:
     # from the corner of the cell, ranges in quanta, directions times DIRECTION_QUANTA.
     sums: Ints
     scans: Counts32  # (C,) number of different scans with returns
+    unit: int = 1  # weight of a mean return in the sums
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
         return cls.of_cells(rays, ReturnCells.of(rays, leaf_size_m, num_threads), leaf_size_m, num_threads)
 
     @classmethod
-    def of_cells(cls, rays: Rays, cells: ReturnCells, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
-        sums = sum_returns(*rays.in_c_order(), cells.cell_of_ray, cells.keys, leaf_size_m, num_threads)
+    def of_cells(
+        cls,
+        rays: Rays,
+        cells: ReturnCells,
+        leaf_size_m: float,
+        num_threads: int = 0,
+        weights: Ints32 | None = None,
+    ) -> ScanSums:
+        """Sum up `rays` by their cells. `weights` (N,): of each return, in parts of 1 / `WEIGHT_UNIT`; None: all are 1."""
+        where = cells.cell_of_ray, cells.keys, leaf_size_m
+        sums = sum_returns(*rays.in_c_order(), *where, num_threads, weights)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
-        return cls(leaf_size_m, cells.keys, sums, scans)
+        return cls(leaf_size_m, cells.keys, sums, scans, 1 if weights is None else WEIGHT_UNIT)
 
     @property
     def counts(self) -> Floats:
-        return self.sums[:, 0].astype(np.float64)
+        """(C,) sum of the weights of the returns: without weights, their number."""
+        return self.sums[:, 0] / float(self.unit)
 
     def merged_moments(self) -> tuple[Keys, Floats]:
         """Return the keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
 
         The sums are those of 1; x, y, z, local, m; xx, xy, xz, yy, yz, zz, m²; and the direction (3).
         """
-        return merge_sums(self.keys, np.ascontiguousarray(self.sums), self.leaf_size_m)
+        keys, moments = merge_sums(self.keys, np.ascontiguousarray(self.sums), self.leaf_size_m)
+        return keys, moments if self.unit == 1 else moments / self.unit
 
 
 @dataclass(frozen=True)
@@ -122,7 +136,7 @@ class MeanRays:
     def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> MeanRays:
         means = mean_rays(sums.keys, np.ascontiguousarray(sums.sums), sums.leaf_size_m, num_threads)
         points, directions, ranges_m, counts = means
-        return cls(sums.keys, points, directions, counts, sums.scans, ranges_m)
+        return cls(sums.keys, points, directions, counts / np.float32(sums.unit), sums.scans, ranges_m)
 
     def select(self, part: Bools | Ints) -> MeanRays:
         rows = np.flatnonzero(part) if part.dtype == np.bool_ else part

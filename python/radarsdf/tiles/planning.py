@@ -28,6 +28,7 @@ from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
+from radarsdf.rig import Label
 from radarsdf.scans import Scan, scans_in_memory
 from radarsdf.threads import ThreadPool
 from radarsdf.tiles.plan import Plan, Tile, TileGrid, TilePlan, folder_of
@@ -106,6 +107,7 @@ class _Planner:
         self._samples: list[tuple[int, Scan]] = []  # scans with the smallest hashes
         self._intensities = Intensities()
         self._with_intensities: bool | None = None
+        self._radar: Label | None = None
 
     def add(self, scans: list[Scan], first: int) -> None:
         for number, scan in enumerate(scans, first):
@@ -113,6 +115,9 @@ class _Planner:
             alike = self._with_intensities in (None, has)
             check(alike, f"all scans have intensities, or none: scan {number} is not like those before it")
             self._with_intensities = has
+            self._radar = scan.sensor if self._radar is None else self._radar
+            one = f"tiles are of one radar, not of {self._radar!r:.50} and {scan.sensor!r:.50}: fit them with radarsdf.fit"
+            check(scan.sensor == self._radar, one)
             self._samples.append((zlib.crc32(np.asarray(scan.points).tobytes()), scan))
             self._samples = sorted(self._samples, key=itemgetter(0))[:_SENSOR_SCANS]
         rays = self._rays(scans, first)
@@ -148,7 +153,9 @@ class _Planner:
         """Prepare the static returns, checked, in a frame of their own."""
         held, given = scans_in_memory(scans), self._config.preparation
         try:
-            static = StaticReturns.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
+            static = StaticReturns.of(
+                held.points, held.intensities, held.doppler_mps, self._config.returns, held.rig
+            )
             return prepare(static.points, held.poses, static.intensities, whole=False, **given)
         except (ValueError, TypeError) as error:
             msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"

@@ -210,7 +210,7 @@ class ScanClouds:
         self._server, self._map, self._scans = server, radar_map, list(scans)
         self._scale, self._text = scale, text
         self._shown: int | None = None
-        path = scans.poses[:, :3, 3] - radar_map.origin
+        path = scans.sensor_poses[:, :3, 3] - radar_map.origin
         line = add_path(server, "/scans/path", path, SCAN_COLORS["trajectory"])
         self.nodes: dict[str, Any] = {"trajectory": line}
         self.show(0)

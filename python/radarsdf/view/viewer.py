@@ -62,10 +62,10 @@ class Viewer(Page):
     def _fill(self, scans: Scans | None) -> None:
         server, radar_map, surface = self._server, self._map, self.surface
         origin = radar_map.origin
-        path = np.zeros((0, 3)) if scans is None else scans.poses[:, :3, 3] - origin
+        path = np.zeros((0, 3)) if scans is None else scans.sensor_poses[:, :3, 3] - origin
         self._extent = np.concatenate([surface.vertices - origin, path])
         set_initial_camera(server, framing_pose(self._extent))
-        x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
+        x, y, z = (origin if scans is None else scans.sensor_poses[0, :3, 3]).tolist()
         self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
         self._clicked: Floats | None = None
         panel = self._add_controls()
