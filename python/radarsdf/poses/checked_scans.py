@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Floats
+from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import MAX_TIME_S, check, real_array
 from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities, radial_offset_mps
 from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
-from radarsdf.scans import Scans, filled
+from radarsdf.rig import Rig
+from radarsdf.scans import Scans, chosen, filled, rig_of
 
 _MOST_M = 500.0  # maximum median range, m. Imaging radars reach 300 m
 _INTERVALS_S = 0.002, 20.0  # limits of the median scan interval: 500 Hz, and no overlap of moving scans
@@ -25,8 +27,8 @@ class CheckedScans:
     """Validated scans of one drive, F of them."""
 
     scans: list[Floats]  # (N_i, 3) static returns, sensor frame, m
-    times_s: Floats | None  # (F,) relative to the first scan
-    begin_s: float  # time of the first scan
+    times_s: Floats | None  # (F,) relative to the first scan of all radars
+    begin_s: float  # time of that scan
     velocities: SensorVelocities | None  # from Doppler. None without Doppler, or if it yields no velocity
     moving: int  # number of moving returns left out
     notes: list[str]  # sentences on unused input
@@ -74,6 +76,33 @@ class CheckedScans:
         moving = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
         return cls(standing, times_s, begin_s, velocities, moving, notes)
+
+    @classmethod
+    def of_radars(
+        cls,
+        points: Iterable[ArrayLike] | Scans,
+        doppler_mps: Sequence[ArrayLike] | None,
+        times: ArrayLike | None,
+    ) -> tuple[Rig | None, list[tuple[Ints, CheckedScans]]]:
+        """:meth:`of` for each radar: its scans (K,), checked; and the rig if there are several radars."""
+        rig = rig_of(points)
+        if rig is None:
+            found = cls.of(points, doppler_mps, times)
+            return None, [(np.arange(len(found.scans)), found)]
+        check(
+            rig.T_body_sensor is not None, "T_body_sensor is missing: the mounting of each radar of the rig"
+        )
+        given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
+        times_s = None if times is None else _checked_times(times, len(given))
+        radars = []
+        for rows in rig.scans_of_radars():
+            own_s = None if times_s is None else times_s[rows]
+            checked = cls.of([given[i] for i in rows], chosen(doppler_mps, rows), own_s)
+            if checked.times_s is not None and times_s is not None:
+                since_s = checked.times_s + (checked.begin_s - times_s[0])
+                checked = dataclasses.replace(checked, times_s=since_s, begin_s=float(times_s[0]))
+            radars.append((rows, checked))
+        return rig, radars
 
     def check_intervals(self) -> None:
         """Raise a ValueError if the times between scans cannot be in seconds."""

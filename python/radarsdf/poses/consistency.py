@@ -128,6 +128,19 @@ class Consistency:
             covariance[rows, :3, :3] += np.einsum("dfi,dfj->fij", off, off)
         return covariance
 
+    def of_scans(self, rows: Ints) -> Consistency:
+        """Return the same for the drive of which these scans, `rows` (K,), were compared."""
+
+        def numbered(found: OtherMotion) -> OtherMotion:
+            return dataclasses.replace(found, first=int(rows[found.first]), last=int(rows[found.last]))
+
+        found, doubts = self.contradicted, self.doubts
+        return dataclasses.replace(
+            self,
+            contradicted=None if found is None else numbered(found),
+            doubts=None if doubts is None else tuple(map(numbered, doubts)),
+        )
+
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if returns contradict them; and notes."""
         if self.contradicted is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
-from radarsdf.poses.motion import KnownMotion, spans_of, way
+from radarsdf.poses.motion import KnownMotion, MotionRate, spans_of, turned_halfway, usual_duration_s, way
 from radarsdf.poses.rigid import rotation, rotation_vector, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, folding_interval_mps, sensor_velocities
@@ -111,6 +111,23 @@ class SensorVelocities:
         covariance = factor**2 * self.covariance + sigma**2 * mean[:, :, None] * mean[:, None, :]
         return dataclasses.replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
 
+    @property
+    def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
+        """Velocities at the beginning and the end of steps, (F - 1, 3) each, and derivatives by turn rates, (F - 1, 3, 3) m."""
+        return self.mean_mps[:-1], self.mean_mps[1:], None
+
+    def learnt(self, turn_rates: Sequence[MotionRate | None]) -> SensorVelocities:  # noqa: ARG002 - for several radars
+        """Return velocities whose systematic errors are estimated from turn rates (F - 1), rad/s; None: unknown."""
+        return self
+
+    def measure_turns(self, durations_s: Floats, least: float) -> bool:  # noqa: ARG002 - for several radars
+        """Whether these velocities remove at least this share of the variance of yaws between scans."""
+        return False
+
+    def turn_given(self, turn: MotionRate, i: int, duration_s: float) -> MotionRate:  # noqa: ARG002 - for several radars
+        """Return a turn in the step from scan `i` given these velocities, rad."""
+        return turn
+
     def step_covariance(self, i: int, duration_s: float) -> Floats:
         """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
         ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
@@ -194,7 +211,7 @@ class DopplerMotion(KnownMotion):
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
         spans = spans_of(times_s, len(times_s))
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
-        common = np.repeat([velocities.common_sigma * speed_mps * np.median(durations_s), 0.0], 3)
+        common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
         unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
         return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
@@ -204,11 +221,20 @@ class DopplerMotion(KnownMotion):
 
     def turned(self, rotations: Floats) -> DopplerMotion:
         """Update the translations for rotations (F - 1, 3, 3) of the steps."""
-        between, means = self.steps.copy(), self.velocities.mean_mps
+        between, (begin, end, levers) = self.steps.copy(), self.velocities.of_steps
         between[:, :3, :3] = rotations
         turns = rotation_vector(rotations, self.turns)
-        between[:, :3, 3] = way(turns, means[:-1], means[1:], self.durations_s[:, None])
+        between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None])
+        if levers is not None:
+            between[:, :3, 3] += turned_halfway(turns, np.einsum("fij,fj->fi", levers, turns))
         return dataclasses.replace(self, steps=between)
+
+    def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
+        both, levers = super().jacobians(poses), self.velocities.of_steps[2]
+        if levers is not None:
+            for jacobian in both:
+                jacobian[:, :3] -= levers @ jacobian[:, 3:]
+        return both
 
 
 class _Pair:

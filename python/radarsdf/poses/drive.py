@@ -14,10 +14,19 @@ from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.doppler import YAW_STEP_RAD, DopplerMotion, SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope
-from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, Priors, SteadyMotion
+from radarsdf.poses.motion import (
+    Motion,
+    MotionPrior,
+    MotionRate,
+    PredictedStep,
+    Priors,
+    SteadyMotion,
+    usual_duration_s,
+)
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation
-from radarsdf.poses.tracking import Tracked, Tracker
+from radarsdf.poses.tracking import WINDOW, Tracked, Tracker
+from radarsdf.rig import Rig
 
 _PASSES = 3
 # Initial priors, replaced by the drive's own rates after the first pass. With 1 rad/s, the first steps of sparse real
@@ -39,7 +48,7 @@ _GYROSCOPE_RAD = 0.003  # initial deviation of a step's rotation by a gyroscope
 class Drive:
     """Measurements of a drive without poses."""
 
-    scans: list[Floats]  # (N_i, 3) static returns, sensor frame, m
+    scans: list[Floats]  # (N_i, 3) static returns, frame of the poses, m
     times_s: Floats
     velocities: SensorVelocities | None
     gyroscope: Gyroscope | None
@@ -50,6 +59,7 @@ class Drive:
     steady: Priors = MOVES, TURNS
     # (2, F - 1) rough yaws between scans of a sensor that turns fast, for the sign of the Doppler and its reverse. NaN if unknown.
     yaws: Floats | None = None
+    rig: Rig | None = None  # of several radars. The poses are those of its body
 
     def predict(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
         """Predict the step to scan `i` from the rates of the previous one; None if unknown."""
@@ -67,13 +77,22 @@ class Drive:
                 gain = before[:, 2] / (before[2, 2] + YAW_STEP_RAD**2 / 4)
                 mean = turned.mean + gain * (yaw - turned.mean[2])
                 turned = MotionRate(mean, before - np.outer(gain, before[2]))
+        lever = None
         if self.velocities is not None:
+            turned = self.velocities.turn_given(turned, i - 1, duration_s)
             covariance = self.velocities.step_covariance(i - 1, duration_s)
-            begin, end = self.velocities.mean_mps[i - 1 : i + 1]
+            begins, ends, levers = self.velocities.of_steps
+            begin, end = begins[i - 1], ends[i - 1]
+            lever = None if levers is None else levers[i - 1]
         else:
             velocity = self.moves.after(move, elapsed_s)
             covariance, begin, end = velocity.integrate(duration_s).covariance, velocity.mean, velocity.mean
-        return PredictedStep(turned, begin, end, covariance, duration_s)
+        return PredictedStep(turned, begin, end, covariance, duration_s, lever)
+
+    @property
+    def window(self) -> int:
+        """Number of scans in the map by which the next ones are tracked."""
+        return WINDOW * (1 if self.rig is None else len(self.rig.labels))
 
     @property
     def usual_turn_rad_s(self) -> float:
@@ -92,7 +111,7 @@ class Drive:
         """Return the measured motions between the scans of `rows`."""
         times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
         turns = np.stack([found.turn for found in tracked[rows][1:]])
-        duration_s, turn_sigma_rad_s = float(np.median(np.diff(times_s))), np.full(3, self.usual_turn_rad_s)
+        duration_s, turn_sigma_rad_s = usual_duration_s(np.diff(times_s)), np.full(3, self.usual_turn_rad_s)
         usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
         measured = np.repeat([self.velocities is not None, self.gyroscope is not None], 3)
         motions: list[Motion] = [SteadyMotion.by(self.steady, usual, times_s, poses, measured)]
@@ -122,7 +141,7 @@ def track_drive(
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
-        tracked, rates = track_once(drive, Tracker(cell_m, config.returns, num_threads))
+        tracked, rates = track_once(drive, Tracker(cell_m, config.returns, num_threads, drive.window))
         turn_rates, move_rates = [turn for turn, _ in rates], [move for _, move in rates]
         turns, moves = drive.turns, drive.moves
         if i == 0 and drive.turns_slowly and tracked[-1].segment > 0:
@@ -137,6 +156,8 @@ def track_drive(
             moves=moves.learnt(move_rates, durations_s),
             steady=(steady_moves, steady_turns),
         )
+        if i == 0 and drive.velocities is not None:
+            drive = dataclasses.replace(drive, velocities=drive.velocities.learnt(turn_rates))
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.
             drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(turn_rates))
@@ -154,8 +175,10 @@ def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rate
         tracker.add(scan, now)
         if predicted is not None:
             before, duration_s = tracked[-1], predicted.duration_s
-            known = now.segment == before.segment and duration_s > 0
-            last = rates_of(before.pose, now, duration_s) if known else (None, None)
+            if now.segment != before.segment:
+                last = None, None
+            elif duration_s > 0:  # else, two radars measured at once
+                last = rates_of(before.pose, now, duration_s)
             rates.append(last)
         tracked.append(now)
     return tracked, rates

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radarsdf.arrays import Floats
-from radarsdf.poses.motion import MotionRate
+from radarsdf.poses.motion import MotionRate, usual_duration_s
 from radarsdf.poses.rigid import rotation, rotation_vector
 
 # Prior bias and noise, of cheap gyroscopes, until they are estimated from the drive.
@@ -75,7 +75,7 @@ class Gyroscope:
     @property
     def _noise(self) -> Floats:
         """Variance (F - 1,) of each component of a rotation, rad²."""
-        return self.noise_rad2 * self.durations_s / max(float(np.median(self.durations_s)), 1e-9)
+        return self.noise_rad2 * self.durations_s / max(usual_duration_s(self.durations_s), 1e-9)
 
     def step(self, i: int) -> MotionRate:
         """Return the rotation vector from scan `i` to the next, rad."""

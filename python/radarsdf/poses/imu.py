@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from radarsdf.arrays import Floats
+from radarsdf.arrays import Floats, Ints
 from radarsdf.imu import Imu
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S, Gyroscope, integrate_rates, interpolate
@@ -84,6 +84,7 @@ class ImuAlignment:
     sigma_rad: float  # its standard deviation about the least certain axis. 0: given
     time_offset_s: float  # delay of the times of scans in the clock of the IMU
     lever_m: Floats  # (3,) position of the radar in the axes of the IMU
+    covariance: Floats  # (7, 7) of `lever_m`, the rotation vector in the axes of the IMU, and the time offset
     gyroscope: Gyroscope
     up: Floats  # (F, 3) unit vectors in the frame of the radar at each scan
 
@@ -94,8 +95,13 @@ class ImuAlignment:
         return f"The IMU's axes were {how}, scans are {self.time_offset_s:.3f} s late in its clock, and its accelerometer gives the vertical."
 
     @classmethod
-    def of(cls, imu: Imu, velocities: SensorVelocities, times_s: Floats) -> ImuAlignment | None:
-        """Estimate from velocities at ascending `times_s` (F,). None if it is not observable, or does not explain them."""
+    def of(
+        cls, imu: Imu, velocities: SensorVelocities, times_s: Floats, scan_times_s: Floats | None = None
+    ) -> ImuAlignment | None:
+        """Estimate from velocities at ascending `times_s` (K,). None if it is not observable, or does not explain them.
+
+        `scan_times_s` (F,): times of the scans of all radars, if there are several.
+        """
         if imu.specific_force is None or len(times_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
             return None
         rows, window = _windows(times_s)
@@ -116,12 +122,17 @@ class ImuAlignment:
         R, gravity, lever_m, late_s, motion = model.unpack(x)
         if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(late_s) > 2 * _MAX_TIME_OFFSET_S:
             return None
+        times_s = times_s if scan_times_s is None else scan_times_s
         # Against gravity, Qᵀ g in the axes of the IMU.
         up = -np.einsum("ij,fkj,k->fi", R, motion.at(times_s - late_s)[1], gravity)
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         rates, bias_rad_s = np.einsum("ij,gj->gi", R, motion.rates), np.sqrt(covariance.diagonal()[13:].max())
         gyroscope = Gyroscope.of(rates, imu.times_s + late_s, times_s, float(bias_rad_s))
-        return cls(R, sigma_rad, late_s, lever_m, gyroscope, up)
+        used = np.array([9, 10, 11, 0, 1, 2, 12])
+        kept = covariance[np.ix_(used, used)]
+        if known:
+            kept[3:6] = kept[:, 3:6] = 0.0
+        return cls(R, sigma_rad, late_s, lever_m, kept, gyroscope, up)
 
 
 def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -248,9 +259,14 @@ class Inertial:
 
     @classmethod
     def of(
-        cls, imu: Imu | None, velocities: SensorVelocities | None, times_s: Floats, begin_s: float
+        cls,
+        imu: Imu | None,
+        velocities: SensorVelocities | None,
+        times_s: Floats,
+        begin_s: float,
+        radar: Ints | slice = slice(None),
     ) -> Inertial:
-        """Build for scans at `times_s` (F,) relative to `begin_s`, in the clock of the IMU."""
+        """Build for scans at `times_s` (F,) relative to `begin_s`, in the clock of the IMU. `velocities`: at those of `radar`."""
         if imu is None:
             return cls(None)
         # Check units first.
@@ -263,8 +279,10 @@ class Inertial:
         imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             return cls(None).without("it measured before or after all scans. Are both times of one clock?")
-        if velocities is not None and (found := ImuAlignment.of(imu, velocities, times_s)) is not None:
-            return cls(found.gyroscope, found)
+        if velocities is not None:
+            found = ImuAlignment.of(imu, velocities, times_s[radar], times_s)
+            if found is not None:
+                return cls(found.gyroscope, found)
         if imu.R_sensor_imu is None:
             why = "as accelerometer and Doppler do not determine it: give R_sensor_imu"
             return cls(None).without(f"its rotation on the radar is unknown, {why}")

@@ -15,6 +15,7 @@ from radarsdf.poses.rigid import rotation, rotation_vector, skew, step_vectors, 
 _PRIOR_STEPS = 3.0  # weight of the initial motion prior, steps
 _SPAN = 4.0  # width of a search, standard deviations
 _FEWEST, _MOST = 64, 8192  # limits of the number of poses of a search
+_AT_ONCE = 1e-3  # duration of a step between two radars that measure at the same time, median steps
 _LEAST_SPAN = 0.1  # minimum duration of a step, median steps: two scans at the same time may still differ
 _YAW = 5  # component of a step
 _LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # minimum deviations, below the resolution of any radar
@@ -98,6 +99,11 @@ def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Fl
     return duration_s / 6 * (begin_mps + 4 * middle + end)
 
 
+def turned_halfway(turn: Floats, vectors: Floats) -> Floats:
+    """Rotate vectors (..., 3) of the middle of a step to its beginning."""
+    return np.einsum("...ij,...j->...i", rotation(0.5 * turn), vectors)
+
+
 @dataclass(frozen=True)
 class PredictedStep:
     """Predicted motion from one scan to the next, in the frame of the first, before its returns are used."""
@@ -107,17 +113,24 @@ class PredictedStep:
     end_mps: Floats  # (3,) velocity at the second scan, in its frame
     translation_covariance: Floats  # (3, 3) of the translation given the turn, m²
     duration_s: float
+    lever: Floats | None = (
+        None  # (3, 3) derivative of the translation by the turn, of velocities of other points, m
+    )
 
     def pose(self, turn: Floats | None = None) -> Floats:
         """Return the pose (..., 4, 4) after rotation vectors `turn` (..., 3). None: the predicted one."""
         turn = self.turn.mean if turn is None else turn
-        return transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s))
+        found = transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s))
+        if self.lever is not None:
+            found[..., :3, 3] += turned_halfway(turn, np.einsum("ij,...j->...i", self.lever, turn))
+        return found
 
     def covariance(self, turn: Floats | None = None) -> Floats:
         """Return the covariance (6, 6) of translation and rotation vector, in the first frame, correlated by the turn."""
         turn = self.turn.mean if turn is None else turn
         # Derivative of the translation by the turn: about that of its second half.
         swept = -skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
+        swept = swept if self.lever is None else swept + self.lever
         both = np.concatenate([swept, np.eye(3)])
         covariance = both @ self.turn.covariance @ both.T
         covariance[:3, :3] += self.translation_covariance
@@ -198,10 +211,14 @@ class Motion:
         off_m = found[:, :3, 3] - self.steps[:, :3, 3]
         return np.concatenate([off_m, rotation_vector(turns)], 1)
 
+    def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Return Jacobians (F - 1, 6, 6) of :meth:`errors` by increments of the first and the second pose of a step."""
+        return _jacobians(poses)
+
     def prior(self, poses: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the normal equations of increments of `poses`: diagonal blocks (F, 6, 6), sub-diagonal ones, gradient (F, 6)."""
         information = 1 / (np.repeat(self.variances, 3) * self.shares)
-        first, second = _jacobians(poses)
+        first, second = self.jacobians(poses)
         errors = (self.errors(poses) - self.bias * self.spans[:, None]) * information
         diagonal, gradient = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
         for rows, jacobian in ((slice(None, -1), first), (slice(1, None), second)):
@@ -214,7 +231,7 @@ class Motion:
         rows = np.flatnonzero(self.bias_sigma)
         weights = self.spans[:, None] / (np.repeat(self.variances, 3) * self.shares) * self.bias_sigma
         found = np.zeros((len(rows), len(poses), 6))
-        for scans, jacobian in zip((slice(None, -1), slice(1, None)), _jacobians(poses), strict=True):
+        for scans, jacobian in zip((slice(None, -1), slice(1, None)), self.jacobians(poses), strict=True):
             found[:, scans] -= np.einsum("fki,fk->kfi", jacobian[:, rows], weights[:, rows])
         return found, (weights * self.spans[:, None] * self.bias_sigma).sum(axis=0)[rows]
 
@@ -267,7 +284,7 @@ class SteadyMotion(KnownMotion):
     ) -> SteadyMotion:
         """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `measured` by other sources."""
         spans = spans_of(times_s, len(times_s))
-        duration_s = float(np.median(np.diff(times_s)))
+        duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(measured, np.inf, 1.0), (len(spans), 1))
         unknown = np.zeros(6), np.ones(2), shares, spans
         return cls(steps(poses), *unknown, priors, duration_s * spans, duration_s**2 * usual).at(poses)
@@ -307,5 +324,13 @@ def spans_of(times_s: Floats | None, num_scans: int) -> Floats:
     """Return durations (F - 1,) of steps relative to the median. Without times, all are 1."""
     equal = np.ones(num_scans - 1)
     durations = equal if times_s is None else np.maximum(np.diff(times_s), 0.0)
-    median = float(np.median(durations)) if len(durations) else 0.0
-    return np.maximum(durations / median, _LEAST_SPAN) if median > 0 else equal
+    usual_s = usual_duration_s(durations)
+    if usual_s == 0:
+        return equal
+    return np.where(durations > 0, np.maximum(durations / usual_s, _LEAST_SPAN), _AT_ONCE)
+
+
+def usual_duration_s(durations_s: Floats) -> float:
+    """Return the median of those durations that are positive: radars of a rig may measure at once. 0 if there are none."""
+    positive = durations_s[durations_s > 0]
+    return float(np.median(positive)) if len(positive) else 0.0

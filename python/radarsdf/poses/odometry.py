@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
+from radarsdf.poses.body import MeasuredScans, join_radars
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance, turns_fast
@@ -25,14 +26,10 @@ from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import steps
-from radarsdf.poses.tracking import WINDOW, Tracked
+from radarsdf.poses.tracking import Tracked
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
-
-# Minimum share of the prior variance of a step's rotation that the returns must remove: over the window of scans, it adds up to
-# all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
-_LEAST_OBSERVED_TURN = 1 / WINDOW
 
 
 class UnobservedMotionError(ValueError):
@@ -44,7 +41,8 @@ class Odometry:
     """Poses estimated from the radar alone."""
 
     poses: Floats
-    """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
+    """(F, 4, 4) T_world_sensor, m; of a rig, T_world_body. The world is the frame of the first scan; with an accelerometer,
+    rotated so that z points up."""
     covariance: Floats
     """(F, 6, 6) as in :class:`RefinedPoses`, relative to the middle scan of each segment."""
     segments: Ints
@@ -82,14 +80,15 @@ def odometry(
     ----------
     points : iterable of F arrays, or Scans
         (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. :class:`radarsdf.io.Scans` supply times and
-        Doppler unless these are passed separately.
+        Doppler unless these are passed separately. Of a rig, whose radars need not measure at the same times, they give
+        the poses of the body.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each, radial speed, m/s, of either sign, aliased or not; NaN where it was not measured.
     times_s : (F,) array_like
         Times of the scans, s.
     imu : Imu, optional
-        A gyroscope, optionally with an accelerometer. Default: that of `Scans`. Without `R_sensor_imu`, its mounting rotation is
-        estimated, and with an accelerometer and Doppler its time offset and the vertical, too.
+        A gyroscope, optionally with an accelerometer. Default: that of `Scans`. Without `R_sensor_imu` (of a rig, to the body), its
+        mounting rotation is estimated, and with an accelerometer and Doppler its time offset and the vertical, too.
     config : FitConfig, optional
         Settings, of which ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -125,33 +124,26 @@ def odometry(
     """
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    checked = CheckedScans.of(points, doppler_mps, times_s)
-    if checked.times_s is None:
-        msg = "times_s are missing: the time of each scan, s"
-        raise ValueError(msg)
-    checked.check_intervals()
-    times_s, velocities, sign, yaws = checked.times_s, checked.velocities, 1, None
-    if velocities is not None:
-        significance, both = sign_significance(checked.scans, velocities, times_s)
-        if significance < -CLEAR:
-            sign, both, velocities = -1, both[::-1], velocities.scaled(-1.0)
-        yaws = both if turns_fast(both[0]) else None
+    rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
+    for _, checked in radars:
+        if checked.times_s is None:
+            msg = "times_s are missing: the time of each scan, s"
+            raise ValueError(msg)
+        checked.check_intervals()
     if imu is None and isinstance(points, Scans):
         imu = points.imu
-    limits, notes = config.returns, [*checked.notes]
     with ThreadPool(config.num_threads) as pool:
-        scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-        drive = Drive(scans, times_s, velocities, None, yaws=yaws)
-        consistency = Consistency.of_returns(drive, config, pool.num_threads)
-        if velocities is not None:
-            velocities, tested = consistency.applied(velocities)
-            notes += tested
-            if velocities is not None and (clock := consistency.clock) is not None:
-                times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
-                velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
-        inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
-        yaws = None if velocities is None else yaws
-        drive = Drive(scans, times_s, velocities, inertial.gyroscope, yaws=yaws)
+        compared = [_compare_doppler(rows, checked, config, pool.num_threads) for rows, checked in radars]
+        _, scans, times_s, velocities = join_radars(rig, [each.measured for each in compared])
+        assert times_s is not None
+        notes = [note for each in compared for note in each.notes]
+        # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
+        of_radars = [each.measured.rows for each in compared if each.measured.velocities is not None]
+        radar = max(of_radars, key=len, default=np.arange(len(times_s)))
+        own = None if velocities is None else velocities.select(radar)
+        inertial = Inertial.of(imu, own, times_s, radars[0][1].begin_s, radar)
+        yaws = compared[0].yaws if rig is None else None
+        drive = Drive(scans, times_s, velocities, inertial.gyroscope, yaws=yaws, rig=rig)
         try:
             drive, tracked = track_drive(drive, config, pool.num_threads, progress)
         except UnusableGyroscopeError as why:
@@ -164,7 +156,10 @@ def odometry(
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
         if velocities is not None:
-            covariance = consistency.widened(poses, covariance, segments, drive)
+            known = [each.consistency for each in compared if each.measured.velocities is not None]
+            # Radars of a rig move together: the best known one decides.
+            least = min(known, key=lambda one: len(one.doubts or ()))
+            covariance = least.widened(poses, covariance, segments, drive)
         if inertial.alignment is not None:
             poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -175,16 +170,48 @@ def odometry(
         "length_m": length_m,
         "segments": int(segments[-1]) + 1,
         "doppler": velocities is not None,
-        "doppler_sign": sign,
+        "doppler_sign": compared[0].sign,
         "gyroscope": gyroscope is not None,
         "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
-        "moving": checked.moving,
+        "moving": sum(checked.moving for _, checked in radars),
         "notes": notes,
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
     }
     return Odometry(poses, covariance, segments, report)
+
+
+class _Compared(NamedTuple):
+    """A radar, whose Doppler was compared with its returns."""
+
+    measured: MeasuredScans
+    yaws: Floats | None  # see :class:`Drive`
+    sign: int
+    consistency: Consistency
+    notes: list[str]
+
+
+def _compare_doppler(rows: Ints, checked: CheckedScans, config: FitConfig, num_threads: int) -> _Compared:
+    times_s, velocities, sign, yaws = checked.times_s, checked.velocities, 1, None
+    assert times_s is not None
+    if velocities is not None:
+        significance, both = sign_significance(checked.scans, velocities, times_s)
+        if significance < -CLEAR:
+            sign, both, velocities = -1, both[::-1], velocities.scaled(-1.0)
+        yaws = both if turns_fast(both[0]) else None
+    limits, notes = config.returns, [*checked.notes]
+    scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
+    drive = Drive(scans, times_s, velocities, None, yaws=yaws)
+    consistency = Consistency.of_returns(drive, config, num_threads)
+    if velocities is not None:
+        velocities, tested = consistency.applied(velocities)
+        notes += tested
+        if velocities is not None and (clock := consistency.clock) is not None:
+            times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
+            velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
+    measured = MeasuredScans(rows, scans, times_s, velocities)
+    return _Compared(measured, None if velocities is None else yaws, sign, consistency.of_scans(rows), notes)
 
 
 def _estimate_jointly(
@@ -196,7 +223,8 @@ def _estimate_jointly(
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for segment in range(segments[-1] + 1):
         rows = slice(*np.searchsorted(segments, [segment, segment + 1]).tolist())
-        returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m)
+        rig = None if drive.rig is None else drive.rig.select(rows)
+        returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m, rig)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(tracked, rows)
@@ -219,12 +247,18 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
     moved, turned = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
     removed = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
     doppler = "their Doppler (doppler_mps)"
+    # Minimum share of the prior variance of a step's rotation that the returns must remove: over the window of scans, it adds up
+    # to all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
+    least_turned = 1 / drive.window
     if any(note.startswith(NOT_USED) for note in notes):
         doppler = "Doppler that most returns of a scan agree on"
     if drive.velocities is None and moved < LEAST_OBSERVED:
         refuse("moved", removed.format(moved, LEAST_OBSERVED), doppler)
-    if drive.gyroscope is None and not drive.turns_slowly and turned < _LEAST_OBSERVED_TURN:
-        refuse("turned", removed.format(turned, _LEAST_OBSERVED_TURN), "a gyroscope (imu)")
+    durations_s, velocities = np.diff(drive.times_s), drive.velocities
+    measured = velocities is not None and velocities.measure_turns(durations_s, least_turned)
+    unknown = not measured and drive.gyroscope is None and turned < least_turned
+    if unknown and not drive.turns_slowly:
+        refuse("turned", removed.format(turned, least_turned), "a gyroscope (imu)")
     assumed = []
     if drive.velocities is None:
         within = np.flatnonzero(np.diff([found.segment for found in tracked]) == 0)
@@ -235,7 +269,7 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
         if significance < ERRORS:
             what = "neighbouring scans agree as well without any motion"
             assumed.append(f"Assumed: the sensor moved as estimated; {what}.")
-    if drive.gyroscope is None and turned < _LEAST_OBSERVED_TURN:
+    if unknown:
         why = f"as {LATERAL_MPS2:.0f} m/s² across its trajectory make of its speed"
         what = f"the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, {why}"
         assumed.append(f"Assumed: {what}; the returns of a scan hardly measure it.")

@@ -15,6 +15,7 @@ from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import merged_keys
+from radarsdf.rig import Rig
 
 # Log2 of the edge of a region, cells. Large regions have many planes, and estimate errors well: with 8 cells, the standard
 # deviation along simulated walls was 5 times too small, with 16 to 64 correct.
@@ -93,31 +94,36 @@ class SensorReturns:
     directions: Floats32  # (N, 3) unit vectors
     ranges_m: Floats32  # (N,)
     scans: Ints32  # (N,) ascending
+    rig: Rig | None = None  # radars of the scans, whose poses are then those of the body
 
     @classmethod
-    def of(cls, scans: Sequence[Floats], min_range_m: float, max_range_m: float | None) -> SensorReturns:
-        """Build from scans (N_i, 3), sensor frame, m, without returns outside these ranges."""
+    def of(
+        cls, scans: Sequence[Floats], min_range_m: float, max_range_m: float | None, rig: Rig | None = None
+    ) -> SensorReturns:
+        """Build from scans (N_i, 3), frame of the poses, m, without returns outside these ranges."""
+        scans = scans if rig is None else rig.in_sensors(scans)
         points = np.concatenate(scans)
         ranges_m = np.sqrt(np.einsum("ni,ni->n", points, points))
         number = np.repeat(np.arange(len(scans), dtype=np.int32), [len(scan) for scan in scans])
         kept = ranges_m >= max(min_range_m, _LEAST_RANGE_M)
         kept &= ranges_m <= (np.inf if max_range_m is None else max_range_m)
         directions = points[kept] / ranges_m[kept, None]
-        return cls(directions.astype(np.float32), ranges_m[kept].astype(np.float32), number[kept])
+        return cls(directions.astype(np.float32), ranges_m[kept].astype(np.float32), number[kept], rig)
 
     def __len__(self) -> int:
         return len(self.scans)
 
     def select(self, part: Bools) -> SensorReturns:
         """Select returns by a mask (N,)."""
-        return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part])
+        return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part], self.rig)
 
     def every(self, step: int) -> SensorReturns:
         """Return every `step`-th return."""
         return self.select(np.arange(len(self)) % step == 0)
 
     def posed(self, poses: Floats) -> Rays:
-        """Convert to rays at sensor poses (F, 4, 4), in a local frame at the mean position."""
+        """Convert to rays at poses (F, 4, 4), in a local frame at the mean position."""
+        poses = poses if self.rig is None else self.rig.sensor_poses(poses)
         origin = poses[:, :3, 3].mean(axis=0)
         first = np.searchsorted(self.scans, np.arange(len(poses) + 1))
         directions = np.empty_like(self.directions)
@@ -127,7 +133,8 @@ class SensorReturns:
         positions = (poses[:, :3, 3] - origin).astype(np.float32)
         points = directions * self.ranges_m[:, None] + positions[self.scans]
         up = poses[:, :3, 2].copy()
-        return Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self))
+        sensors = None if self.rig is None else self.rig.of_scan
+        return Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self), sensors)
 
 
 @dataclass(frozen=True)
@@ -159,7 +166,7 @@ def common_planes(
         rows = slice(*np.searchsorted(rays.scans, [low, high]).tolist())
         part = rays.select(rows)
         surfels = Surfels.of(part, grid.cell_m / LEAVES_PER_SURFEL, num_threads)
-        found = _planes_of(part.points, surfels, num_threads)
+        found = planes_of(part.points, surfels, num_threads)
         planes[rows] = np.where(found >= 0, found + np.int32(total), np.int32(-1))
         centres.append(surfels.centres)
         normals.append(unbiased_normals(surfels, num_threads))
@@ -185,7 +192,7 @@ def common_planes(
     return common, known
 
 
-def _planes_of(points: Floats32, surfels: Surfels, num_threads: int) -> Ints32:
+def planes_of(points: Floats32, surfels: Surfels, num_threads: int) -> Ints32:
     """Return the flat surfel (N,) of each point (N, 3), local, m: that of the cell of its projection onto the surface; -1: none."""
     # Noise moves returns across surfaces into other cells. By the cells of the returns themselves, it would be truncated at cell
     # borders, differently for near and far returns, and rotate poses.

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Floats
+from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.poses.body import MeasuredScans, join_radars
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.displacements import compare_with_poses
 from radarsdf.poses.doppler import NOT_USED, DopplerMotion
@@ -26,6 +27,7 @@ from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut
+from radarsdf.rig import Rig
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
@@ -55,7 +57,7 @@ class RefinedPoses:
     """Refined poses of scans, and whether they are better than the given ones."""
 
     poses: Floats
-    """(F, 4, 4) T_world_sensor: the refined poses if they are an improvement, else the given ones. Mean position and mean
+    """(F, 4, 4) T_world_sensor, of a rig T_world_body: the refined poses if they are an improvement, else the given ones. Mean position and mean
     rotation are those of the given poses."""
     covariance: Floats
     """(F, 6, 6) of `poses`, relative to the middle scan: translation, m, and rotation vector about the sensor, rad, in world
@@ -90,7 +92,7 @@ def refine_poses(
         (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. :class:`radarsdf.io.Scans` supply poses, times
         and Doppler unless these are passed separately.
     poses : array_like, optional
-        (F, 4, 4) T_world_sensor, m, one for each scan.
+        (F, 4, 4) T_world_sensor, m, one for each scan; of a rig, T_world_body.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each, radial speed, m/s, of either sign, aliased or not; NaN where it was not measured. Moving returns are
         excluded. Needs `times_s`.
@@ -132,32 +134,24 @@ def refine_poses(
         poses = points.poses
     if poses is None:
         raise ValueError(MISSING_POSES)
-    checked = CheckedScans.of(points, doppler_mps, times_s)
-    scans, times_s, velocities, notes = checked.scans, checked.times_s, checked.velocities, [*checked.notes]
-    given, rigid = usable_poses(poses, len(scans))
+    rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
+    notes = [note for _, checked in radars for note in checked.notes]
+    given, rigid = usable_poses(poses, sum(len(rows) for rows, _ in radars))
+    compared = [_compare_doppler(rows, checked, given, rig, notes) for rows, checked in radars]
+    _, scans, times, velocities = join_radars(rig, compared)
     if not rigid.all():
         notes += LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes
         scans = [scan if usable else scan[:0] for scan, usable in zip(scans, rigid, strict=True)]
     limits = config.returns
-    returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m)
+    returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
     report: dict[str, Any] = {"scans": len(scans), "returns": len(returns), "notes": notes}
     if len(scans) < 2 or len(returns) == 0:
         report["verdict"] = "The given poses are kept: there are no two scans to compare."
         return RefinedPoses(given, np.zeros((len(given), 6, 6)), False, report)
-    sigma_m, sigma_rad = np.maximum(_FIRST_SIGMAS, unsteadiness(given, times_s)).tolist()
-    motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times_s)]
-    if velocities is not None and times_s is not None:
-        if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
-            velocities = velocities.scaled(-1.0)
-        contradicted, clock = compare_with_poses(velocities, times_s, given)
-        notes += clock.note
-        if contradicted is None:
-            velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
-            motions.append(DopplerMotion.by(velocities, times_s - clock.errors_s, given))
-        else:
-            notes.append(
-                f"{NOT_USED}: {contradicted}. If it is right, leave the poses out: radarsdf.odometry"
-            )
+    sigma_m, sigma_rad = np.maximum(_FIRST_SIGMAS, unsteadiness(given, times)).tolist()
+    motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times)]
+    if velocities is not None and times is not None:
+        motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
     with ThreadPool(config.num_threads) as pool:
         held = held_out(len(returns), config.seed)
@@ -175,7 +169,7 @@ def refine_poses(
         "bias": found.motions[0].bias.tolist(),
         **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
-        "moving": checked.moving,
+        "moving": sum(checked.moving for _, checked in radars),
         "rounds": found.rounds,
         "seconds": time.perf_counter() - begin,
     }
@@ -186,6 +180,25 @@ def refine_poses(
     placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found.poses[middle]), found.poses)
     off = increments(given, placed)
     return RefinedPoses(given, found.covariance + np.einsum("fi,fj->fij", off, off), False, report)
+
+
+def _compare_doppler(
+    rows: Ints, checked: CheckedScans, given: Floats, rig: Rig | None, notes: list[str]
+) -> MeasuredScans:
+    """Compare the Doppler of a radar with the given poses (F, 4, 4); add notes."""
+    scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
+    if velocities is None or times_s is None or len(rows) < 2:
+        return MeasuredScans(rows, scans, times_s, None)
+    poses = given if rig is None else rig.sensor_poses(given)[rows]
+    if (velocities.mean_mps[:-1] * steps(poses)[:, :3, 3]).sum() < 0:
+        velocities = velocities.scaled(-1.0)
+    contradicted, clock = compare_with_poses(velocities, times_s, poses)
+    notes += clock.note
+    if contradicted is not None:
+        notes.append(f"{NOT_USED}: {contradicted}. If it is right, leave the poses out: radarsdf.odometry")
+        return MeasuredScans(rows, scans, times_s, None)
+    velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
+    return MeasuredScans(rows, scans, times_s - clock.errors_s, velocities)
 
 
 @dataclass(frozen=True)

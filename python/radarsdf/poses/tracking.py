@@ -68,6 +68,7 @@ class Tracker:
     cell_size_m: float  # edge of the cell of a map's surfel, m
     config: ReturnsConfig
     num_threads: int = 0
+    window: int = WINDOW  # scans in the map
     last: Tracked = field(init=False)
     _planes: list[LocalPlanes] = field(default_factory=list)
     # Scans (N, 3), sensor frame, their poses, and the points as added to the planes, for an exact removal.
@@ -105,7 +106,7 @@ class Tracker:
             self._recent.clear()
             self._scans = 0
         points = np.ascontiguousarray(np.einsum("ij,nj->ni", found.pose[:3, :3], scan) + found.pose[:3, 3])
-        oldest = self._recent.popleft() if len(self._recent) == WINDOW else None
+        oldest = self._recent.popleft() if len(self._recent) == self.window else None
         for planes in self._planes:
             planes.add(points)
             if oldest is not None:
