@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import threading
 import weakref
@@ -27,6 +28,8 @@ from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Limits
 from radarsdf.returns.moving import MovingReturns
 from radarsdf.returns.rays import check_scans
+from radarsdf.rig import Label, Mounted
+from radarsdf.scans import Scans
 
 if TYPE_CHECKING:
     import trimesh
@@ -69,6 +72,8 @@ class LiveMap:
     folder : path-like, optional
         An empty, new or previously used folder, to which scans are written instead of being sealed, and regions instead of
         being discarded by :meth:`clear_outside`. It is locked during the lifetime of the map.
+    T_body_sensor : mapping, optional
+        Mounting (4, 4) of each radar of a rig by its label, m. Poses are then T_world_body.
 
     Raises
     ------
@@ -110,6 +115,7 @@ class LiveMap:
         origin: ArrayLike | None = None,
         max_bytes: int | None = None,
         folder: str | PathLike[str] | None = None,
+        T_body_sensor: Mapping[Any, ArrayLike] | None = None,
     ) -> None:
         config = FitConfig() if config is None else instance(config, FitConfig, "config")
         single = config.returns.accumulate_scans == 1
@@ -121,8 +127,13 @@ class LiveMap:
             unlock = weakref.finalize(self, os.close, locked_folder(place))
             if hasattr(os, "register_at_fork"):  # a child process would hold the lock, too
                 os.register_at_fork(after_in_child=unlock)
-        self._state = GrowingState(config, corner, most, place)
-        self._follower = Follower(config)
+        mountings = None
+        if T_body_sensor is not None:
+            mountings = {
+                label: check_pose(T, f"T_body_sensor of {label!r:.50}") for label, T in T_body_sensor.items()
+            }
+        self._state = GrowingState(config, corner, most, place, mountings)
+        self._follower = Follower(config, num_radars=max(len(mountings or ()), 1))
         self._pid = os.getpid()
         self._lock = threading.RLock()  # guards the state
         self._reading = threading.Lock()  # guards its surface; acquired first
@@ -194,6 +205,7 @@ class LiveMap:
         doppler_mps: ArrayLike | None = None,
         time_s: float | None = None,
         scan_id: ScanId | None = None,
+        sensor: Label | None = None,
     ) -> Integrated:
         """Add a scan of N returns.
 
@@ -215,6 +227,8 @@ class LiveMap:
             Time of the scan, s. Required for scans without a pose, and for the scans before them.
         scan_id : hashable, optional
             Identifier of the scan. Default: a consecutive number.
+        sensor : hashable, optional
+            Label of its radar in `T_body_sensor`. Required in the map of a rig, whose radars may measure at the same time.
 
         Returns
         -------
@@ -229,6 +243,11 @@ class LiveMap:
             If a scan without a pose cannot be registered with the last ones; a ValueError.
         """
         scan, far = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
+        mountings = self._state.mountings
+        known = sensor is None if mountings is None else sensor in mountings
+        check(known, f"sensor must be one of T_body_sensor, {list(mountings or ())}, not {sensor!r:.50}")
+        if mountings is not None:
+            scan = dataclasses.replace(scan, radar=Mounted(sensor, mountings[sensor]))
         given = None if pose is None else check_pose(pose, "pose").copy()
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         check(given is not None or scan.time_s is not None, "a scan needs a pose, or a time")
@@ -336,7 +355,14 @@ class LiveMap:
         """
         described, scans, sums = load_state(path)
         config = FitConfig.from_dict(described.config)
-        live = cls(config, origin=described.origin, max_bytes=described.max_bytes, folder=folder)
+        mountings = described.T_body_sensor
+        live = cls(
+            config,
+            origin=described.origin,
+            max_bytes=described.max_bytes,
+            folder=folder,
+            T_body_sensor=mountings,
+        )
         live._state.restore(described, scans, sums)
         for scan_id, scan in zip(described.ids, scans, strict=True):
             live._state.track = live._state.track.placed(scan_id, scan)
@@ -384,10 +410,14 @@ class LiveMap:
         intensities = [scan.intensities for scan in scans if scan.intensities is not None]
         speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
         return fit(
-            [scan.points for scan in scans],
-            np.stack([scan.pose for scan in scans]),
-            intensities or None,
-            doppler_mps=speeds if len(speeds) == len(scans) else None,
+            Scans(
+                [scan.points for scan in scans],
+                np.stack([scan.pose for scan in scans]),
+                intensities or None,
+                doppler_mps=speeds if len(speeds) == len(scans) else None,
+                sensors=None if self._state.mountings is None else [scan.label for scan in scans],
+                T_body_sensor=self._state.mountings,
+            ),
             config=self.config,
             progress=progress,
             origin=origin,

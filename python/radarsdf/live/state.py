@@ -19,7 +19,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
 from radarsdf.interrupts import at_once
 from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, region_places, regions_of
-from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
+from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, rig_of_scans, save_state
 from radarsdf.live.surface import GrowingSurface
 from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
@@ -28,6 +28,7 @@ from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import ScanSums, lattice_of
+from radarsdf.rig import Label
 from radarsdf.threads import resolve_num_threads
 
 _Scans = dict[ScanId, LoggedScan]
@@ -43,9 +44,15 @@ class GrowingState:
     """
 
     def __init__(
-        self, config: FitConfig, origin: Floats | None, max_bytes: int | None, folder: Path | None
+        self,
+        config: FitConfig,
+        origin: Floats | None,
+        max_bytes: int | None,
+        folder: Path | None,
+        mountings: dict[Label, Floats] | None,
     ) -> None:
         self.config = config
+        self.mountings = mountings
         self.quick = FitConfig.quick(  # with the same cells, returns, bridges, seed and limits
             leaf_size_m=config.leaf_size_m,
             seed=config.seed,
@@ -172,8 +179,11 @@ class GrowingState:
     def save(self, path: str | PathLike[str]) -> None:
         """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
         ids: list[Any] = [*self.log.ids, *self.log.sealed]
-        savable = all(type(scan_id) in (int, str) for scan_id in ids)
-        check(savable, "a map can be saved only if the ids of its scans are whole numbers or strings")
+        mountings: list[Any] | None = None
+        if self.mountings is not None:
+            mountings = [(label, T.tolist()) for label, T in self.mountings.items()]
+        savable = all(type(name) in (int, str) for name in [*ids, *(self.mountings or ())])
+        check(savable, "a map can be saved only if ids of scans and labels are whole numbers or strings")
         scans = list(self.log.scans())
         described = Described(
             config=self.config.to_dict(),
@@ -187,6 +197,8 @@ class GrowingState:
             ids=ids[: len(scans)],
             poses=[scan.pose.tolist() for scan in scans],
             times_s=[scan.time_s for scan in scans],
+            mountings=mountings,
+            radars=[] if self.mountings is None else [[*self.mountings].index(scan.label) for scan in scans],
         )
         save_state(path, described, scans, self.sums)
 
@@ -212,7 +224,7 @@ class GrowingState:
 
         def read() -> FitInput:
             rays = _rays_of(scans, self.config, origin).without_outliers()
-            poses = np.stack([scan.pose for scan in scans])
+            poses = np.stack([scan.T_world_sensor for scan in scans])
             moving = sum(int((~scan.is_static).sum()) for scan in scans if scan.is_static is not None)
             scale = IntensityScale.of(rays.intensities)
             return FitInput(rays, scale, poses, moving, sums=sums, visibility=visibility)
@@ -244,9 +256,10 @@ def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: Floats | No
     static = [scan.static for scan in scans]
     return prepare(
         [scan.points for scan in static],
-        np.stack([scan.pose for scan in static]),
+        np.stack([scan.T_world_sensor for scan in static]),
         [scan.intensities for scan in static if scan.intensities is not None] or None,
         origin=origin,
         whole=False,
+        rig=rig_of_scans(static),
         **config.preparation,
     )

@@ -21,6 +21,7 @@ from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.regions import REGION_BITS
 from radarsdf.returns.evidence import BLOCK_BITS
+from radarsdf.rig import Label, Mounted, Rig
 
 ScanId = Hashable
 # Arrays of a scan, and their types.
@@ -59,12 +60,21 @@ def compact(points: Floats) -> Array:
 class LoggedScan:
     """Scan as passed to the map."""
 
-    pose: Floats  # (4, 4) T_world_sensor, m
+    pose: Floats  # (4, 4) T_world_sensor, or T_world_body of a rig, m
     points: Array  # (N, 3) sensor frame, m: float32 if that is lossless, else float64
     intensities: Floats32 | None = None  # (N,) sensor units
     doppler_mps: Array | None = None  # (N,) radial speed
     is_static: Bools | None = None  # (N,) mask of the static returns, those in the map. None: all
     time_s: float | None = None
+    radar: Mounted | None = None  # of several. `pose` is then T_world_body
+
+    @property
+    def T_world_sensor(self) -> Floats:
+        return self.pose if self.radar is None else self.pose @ self.radar.T_body_sensor
+
+    @property
+    def label(self) -> Label | None:
+        return None if self.radar is None else self.radar.label
 
     @property
     def arrays(self) -> dict[str, Array]:
@@ -86,25 +96,34 @@ class LoggedScan:
         return replace(self, pose=pose)
 
 
+def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
+    """Return the radars of the scans, if there are several."""
+    known = [scan.radar for scan in scans if scan.radar is not None]
+    return Rig.of([radar.label for radar in known], dict(known)) if known else None
+
+
 @dataclass(frozen=True)
 class _OnDisk:
     pose: Floats
     path: Path
     time_s: float | None
+    radar: Mounted | None
     num_bytes: int = _BYTES_OF_SCAN // 2
 
     def read(self) -> LoggedScan:
-        return _scan_of(arrays_of(self.path, _KINDS), self.pose, self.time_s)
+        return _scan_of(arrays_of(self.path, _KINDS), self.pose, self.time_s, self.radar)
 
 
-def _scan_of(arrays: Mapping[str, Array], pose: Floats, time_s: float | None) -> LoggedScan:
+def _scan_of(
+    arrays: Mapping[str, Array], pose: Floats, time_s: float | None, radar: Mounted | None
+) -> LoggedScan:
     """Build a scan from the arrays of its file. Raise a KeyError or a ValueError if it is damaged."""
     points = positions(arrays["points"], "points")
     for name, array in arrays.items():
         if name != "points":
             check_values_of_scan(array, points, name, 0)
         check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
-    return LoggedScan(pose, **arrays, time_s=time_s)
+    return LoggedScan(pose, **arrays, time_s=time_s, radar=radar)
 
 
 class ScanLog:
@@ -196,7 +215,7 @@ class ScanLog:
                 continue
             path = self.folder / f"scan-{self._written + len(come):09d}.npz"
             _save(path, **scan.arrays)
-            come[scan_id] = on_disk = _OnDisk(scan.pose, path, scan.time_s)
+            come[scan_id] = on_disk = _OnDisk(scan.pose, path, scan.time_s, scan.radar)
             excess += on_disk.num_bytes
         return self.exchanged(come, (), sealed)
 
@@ -282,6 +301,16 @@ class Described(BaseModel):
     ids: list[int | str]
     poses: list[list[list[float]]]  # T_world_sensor, m, of the scans in `ids`
     times_s: list[float | None]
+    mountings: list[tuple[int | str, list[list[float]]]] | None = (
+        None  # T_body_sensor, m, of the radars of a rig
+    )
+    radars: list[int] = []
+
+    @property
+    def T_body_sensor(self) -> dict[Label, Floats] | None:
+        if self.mountings is None:
+            return None
+        return {label: check_pose(T, f"T_body_sensor of {label!r:.50}") for label, T in self.mountings}
 
 
 def save_state(
@@ -306,8 +335,9 @@ def load_state(path: str | PathLike[str]) -> tuple[Described, list[LoggedScan], 
         check(described.origin is not None or not ids, "the origin is missing")
         names = [{f"{name} {i}": name for name in _KINDS} for i in range(len(described.ids))]
         arrays = arrays_of(path, (*_CELL_COLUMNS, *itertools.chain(*names)))
-        scans = []
-        for of_scan, pose, time_s in zip(names, described.poses, described.times_s, strict=True):
+        scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
+        numbers = described.radars if radars else [0] * len(names)
+        for of_scan, pose, time_s, k in zip(names, described.poses, described.times_s, numbers, strict=True):
             held = {name: arrays[key] for key, name in of_scan.items() if key in arrays}
-            scans.append(_scan_of(held, check_pose(pose, "pose"), time_s))
+            scans.append(_scan_of(held, check_pose(pose, "pose"), time_s, radars[k] if radars else None))
         return described, scans, _sums_of(arrays)

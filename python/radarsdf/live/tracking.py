@@ -14,7 +14,8 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.store import LoggedScan, ScanId, ScanLog
+from radarsdf.live.store import LoggedScan, ScanId, ScanLog, rig_of_scans
+from radarsdf.poses.body import BodyVelocities
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import (
     CLEAR,
@@ -33,6 +34,7 @@ from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begin_segment
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
+from radarsdf.rig import Label, Rig
 
 _STEPS = 100  # steps from which the motion prior is learnt
 _START = 8  # scans of the initialisation, re-estimated after 2, 4 and 8 with motion, or after each while the sign is open
@@ -75,9 +77,15 @@ class Step:
         return self.logged.time_s
 
     @property
-    def scan(self) -> Floats:
+    def sensor_scan(self) -> Floats:
         """(N, 3) static returns, sensor frame, m."""
         return np.ascontiguousarray(self.logged.static.points, np.float64)
+
+    @cached_property
+    def scan(self) -> Floats:
+        """(N, 3) static returns, frame of the poses, m."""
+        rig = rig_of_scans([self.logged])
+        return self.sensor_scan if rig is None else rig.in_body([self.sensor_scan])[0]
 
     @cached_property
     def moves(self) -> bool:
@@ -103,16 +111,28 @@ class Track:
 
 
 @dataclass
+class _Judged:
+    """Last comparison of the Doppler of a radar with its returns."""
+
+    time_s: float = -np.inf  # of its last scan
+    patience: int = _START // 2  # scans until the next one
+    doubts: tuple[str, ...] = (_NOT_COMPARED,)
+
+
+@dataclass
 class Follower:
     """Tracker of the sensor. A cache: the map owns the track and the poses, which are read before each scan."""
 
     config: FitConfig
-    _judged_s: float = -np.inf  # time of the scan whose Doppler was last compared with the returns
-    _patience: int = _START // 2  # scans until the next comparison
-    _doubts: tuple[str, ...] = (_NOT_COMPARED,)  # of the last comparison
+    num_radars: int = 1
+    _judged: dict[Label | None, _Judged] = field(default_factory=dict)  # by label of a radar
     _complete: bool = False  # False while the attributes below change, or if that was interrupted
-    _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
-    _rates: deque[tuple[MotionRate, MotionRate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
+    _steps: deque[Step] = field(init=False)
+    _rates: deque[tuple[MotionRate, MotionRate]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._steps = deque(maxlen=_STEPS * self.num_radars)
+        self._rates = deque(maxlen=_STEPS * self.num_radars - 1)
 
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
@@ -123,8 +143,10 @@ class Follower:
                 msg = "the map has scans, but none with a time to continue from: give the pose of the scan, and its time"
                 raise Lost(msg)
             return [new]
-        if not new.time_s > self._steps[-1].time_s:
-            msg = f"a scan without a pose must be later than the one before it, at {self._steps[-1].time_s:.6f} s"
+        last = self._steps[-1]
+        at_once = new.logged.label != last.logged.label and new.time_s == last.time_s
+        if not (new.time_s > last.time_s or at_once):
+            msg = f"a scan without a pose must be later than the one before it, at {last.time_s:.6f} s"
             raise ValueError(msg)
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
@@ -132,6 +154,7 @@ class Follower:
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
         why = ""
         sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
+        sign_open = sign_open and len(self._of_radar(new)) > 1  # other radars see other places
         if any(step.found.segment for step in found) or (
             sign_open and found[-1].found.agreeing < _LEAST_AGREEING
         ):
@@ -151,8 +174,9 @@ class Follower:
 
     def _leap_mps(self, new: Step) -> float | None:
         """Return the change of the velocity by Doppler, m/s, if it exceeds those before: its sign or scale may have changed."""
-        known = [(one.time_s, one.velocity.velocity_mps) for one in [*self._steps, new] if one.velocity]
-        if new.velocity is None or len(known) < _FEWEST_CHANGES + 2 or not self._steps[-1].moves:
+        steps = self._of_radar(new)
+        known = [(one.time_s, one.velocity.velocity_mps) for one in steps if one.velocity]
+        if new.velocity is None or len(known) < _FEWEST_CHANGES + 2 or not steps[-2].moves:
             return None
         times_s, velocities = (np.array(columns) for columns in zip(*known, strict=True))
         changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / np.sqrt(np.diff(times_s))
@@ -163,26 +187,32 @@ class Follower:
 
     def doubts(self, step: Step) -> tuple[str, ...]:
         """Return what its pose assumes of the Doppler."""
-        return () if step.given or step.velocity is None else self._doubts
+        if step.given or step.velocity is None:
+            return ()
+        return self._judged.get(step.logged.label, _Judged()).doubts
+
+    def _of_radar(self, new: Step) -> list[Step]:
+        """Return the scans of the same radar, with the new one."""
+        return [step for step in [*self._steps, new] if step.logged.label == new.logged.label]
 
     def _judge(self, new: Step) -> None:
         """Compare the Doppler of the last scans with the returns, if due. Raise Lost if these exclude it."""
-        steps = [*self._steps, new]
+        steps, judged = self._of_radar(new), self._judged.setdefault(new.logged.label, _Judged())
         without = [i for i, step in enumerate(steps) if step.velocity is None or step.given]
         steps = steps[max(without, default=-1) + 1 :][-_JUDGED:]
-        count, since = len(steps), sum(step.time_s > self._judged_s for step in steps)
-        if count < _START or since < self._patience:
+        count, since = len(steps), sum(step.time_s > judged.time_s for step in steps)
+        if count < _START or since < judged.patience:
             return
         pulls = np.array([step.pull for step in steps if np.isfinite(step.pull)])[-_START:]
         agreeing = np.array([step.found.agreeing for step in steps])
         pulled = len(pulls) == _START and abs(pulls.mean()) > _PULLED + ERRORS * pulls.std() / np.sqrt(_START)
         parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
         due = count in (_START, 2 * _START)
-        if not (due or pulled or parted or self._doubts):
+        if not (due or pulled or parted or judged.doubts):
             return
         # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
-        self._judged_s, self._patience = new.time_s, self._patience * (1 if due else 2)
-        scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
+        judged.time_s, judged.patience = new.time_s, judged.patience * (1 if due else 2)
+        scans, times_s = [step.sensor_scan for step in steps], np.array([step.time_s for step in steps])
         points, speeds = zip(*((one.logged.points, one.logged.doppler_mps) for one in steps), strict=True)
         try:
             velocities = SensorVelocities.of(points, speeds, times_s).scaled(new.sign or 1.0)
@@ -197,15 +227,16 @@ class Follower:
         if trusted is None and (other := tested.contradicted) is not None and not other.confirmed:
             notes = [f"Assumed: the Doppler is right; {other.words('the returns')}."]
         elif trusted is None:
-            self._judged_s = -np.inf  # the next scans are judged, too
+            judged.time_s = -np.inf  # the next scans are judged, too
             msg = f"{notes[-1]} {begin} Give the poses of this scan and the next ones, or leave their Doppler out"
             raise Lost(msg)
-        self._doubts = tuple(f"{note} {begin}" for note in notes)
+        judged.doubts = tuple(f"{note} {begin}" for note in notes)
 
     def track(self, found: list[Step]) -> Track:
         """Return the track that continues with the scans returned by :meth:`seek`."""
         again = {step.scan_id for step in found}
-        return Track((*(step for step in self._steps if step.scan_id not in again), *found)[-_STEPS:])
+        kept = (*(step for step in self._steps if step.scan_id not in again), *found)
+        return Track(kept[-_STEPS * self.num_radars :])
 
     def _synchronise(self, track: Track, log: ScanLog) -> None:
         """Read the poses of the map: scans may have been added, moved or removed."""
@@ -226,7 +257,7 @@ class Follower:
 
     def _continued_by(self, steps: list[Step], new: int) -> bool:
         """Whether steps are the present ones, without the oldest if there are too many, and `new` ones."""
-        before = [*self._steps][max(0, len(self._steps) + new - _STEPS) :]
+        before = [*self._steps][max(0, len(self._steps) + new - _STEPS * self.num_radars) :]
         poses = ([step.found.pose for step in each] for each in (before, steps[: len(steps) - new]))
         return len(before) + new == len(steps) and all(map(operator.is_, *poses))
 
@@ -235,17 +266,21 @@ class Follower:
         self._steps.clear()
         self._rates.clear()
         for i, step in enumerate(steps):
-            self._add(step, planes=i >= len(steps) - WINDOW)
+            self._add(step, planes=i >= len(steps) - WINDOW * self.num_radars)
 
     def _add(self, step: Step, *, planes: bool = True) -> None:
         if self._steps:
             before, found = self._steps[-1], step.found
             turn = rotation_vector(before.found.pose[:3, :3].T @ found.pose[:3, :3], found.turn)
             step = dataclasses.replace(step, found=dataclasses.replace(found, turn=turn))
-            self._rates.append(rates_of(before.found.pose, step.found, step.time_s - before.time_s))
+            duration_s = step.time_s - before.time_s
+            rates = rates_of(before.found.pose, step.found, duration_s) if duration_s > 0 else None
+            if rates is not None or self._rates:
+                self._rates.append(rates or self._rates[-1])
         else:
             cell_m = plane_cell_m([step.scan], self.config.leaf_size_m)
-            self._tracker = Tracker(cell_m, self.config.returns, self.config.num_threads)
+            window = WINDOW * self.num_radars
+            self._tracker = Tracker(cell_m, self.config.returns, self.config.num_threads, window)
         self._steps.append(step)
         if planes:
             self._tracker.add(step.scan, step.found)
@@ -254,14 +289,15 @@ class Follower:
         """Estimate the velocity from the Doppler of a scan, if that yields one."""
         if logged.doppler_mps is None:
             return None
-        others = [step.logged.doppler_mps for step in list(self._steps)[-WINDOW:]]
+        own = [step for step in self._steps if step.logged.label == logged.label]
+        others = [step.logged.doppler_mps for step in own[-WINDOW:]]
         known = [speeds for speeds in others if speeds is not None]
         found = sensor_velocities([logged.points], [logged.doppler_mps], known)[0]
         return found if found.found else None
 
     def _next(self, new: Step, sign: int) -> Step:
         """Register a scan from the previous one."""
-        steps = [*list(self._steps)[-2:], new]
+        steps = [*list(self._steps)[-2 * self.num_radars :], new]
         durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
         turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
         drive = Drive(
@@ -271,11 +307,12 @@ class Follower:
             None,
             TURNS.learnt(turns, durations_s),
             MOVES.learnt(moves, durations_s),
+            rig=_rig_of(steps),
         )
         turn, move = self._rates[-1] if self._rates else (None, None)
         expected = drive.predict(len(steps) - 1, turn, move)
         found = self._tracker.register(drive.scans[-1], expected)
-        if drive.velocities is not None and sign and not found.agreeing > 0:
+        if drive.rig is None and drive.velocities is not None and sign and not found.agreeing > 0:
             # A sensor that turns faster than predicted was dead-reckoned, or lost.
             _, yaws = sign_significance(drive.scans, drive.velocities, drive.times_s)
             expected = dataclasses.replace(drive, yaws=yaws, turns=TURNS).predict(len(steps) - 1, turn, move)
@@ -294,12 +331,21 @@ class Follower:
             for one in (step.velocity for step in steps)
         ]
         mean, covariance, _ = upright(*(np.array(columns) for columns in zip(*each, strict=True)))
-        known = [(one.time_s, one.velocity.velocity_mps) for one in [*self._steps, steps[-1]] if one.velocity]
+        own = self._of_radar(steps[-1])
+        known = [(one.time_s, one.velocity.velocity_mps) for one in own if one.velocity]
         times_s, speeds = (np.array(columns) for columns in zip(*known, strict=True))
-        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (times_s[-1] - times_s[0])
+        change = MOVES.change
+        if len(known) > 1:
+            change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (times_s[-1] - times_s[0])
         static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
-        return _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
+        velocities = _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
+        if (rig := _rig_of(steps)) is None:
+            return velocities
+        measured = np.array([step.velocity is not None for step in steps])
+        parts = [rows[measured[rows]] for rows in rig.scans_of_radars()]
+        radars = [(rows, velocities.select(rows)) for rows in parts if len(rows)]
+        return BodyVelocities.of_radars(rig, radars, np.array([step.time_s for step in steps]))
 
     def _start(self, log: ScanLog, new: Step, sign: int) -> list[Step] | None:
         """Re-estimate the first scans by odometry, if due. None if the next scan can be registered with the previous ones."""
@@ -307,10 +353,11 @@ class Follower:
         fixed = [i for i, step in enumerate(steps) if step.given or log.entry(step.scan_id) is None][:-1]
         first = max(fixed, default=0)
         moving = [i for i in range(first, len(steps)) if steps[i].moves]
-        first = max([first, len(steps) - _START, *(i - 1 for i in moving[:1])])
+        most = _START * self.num_radars
+        first = max([first, len(steps) - most, *(i - 1 for i in moving[:1])])
         count, sign_open = len(moving), sign == 0 and new.velocity is not None
-        due = count & (count - 1) == 0 and (sign_open or (first < _KNOWN_STEPS and count <= _START))
-        due = due or (sign_open and count <= _START)
+        due = count & (count - 1) == 0 and (sign_open or (first < _KNOWN_STEPS and count <= most))
+        due = due or (sign_open and count <= most)
         if not new.moves or not due:
             return None
         sign, tracked = self._followed(steps[first:], sign)
@@ -329,25 +376,39 @@ class Follower:
 
     def _followed(self, steps: list[Step], sign: int) -> tuple[int, list[Tracked]]:
         """Return the sign of the Doppler, 0 if not significant, and the scans tracked by odometry, in the frame of the first."""
-        drive = Drive([step.scan for step in steps], np.array([step.time_s for step in steps]), None, None)
-        points = [step.logged.points for step in steps]
-        speeds = [step.logged.doppler_mps for step in steps if step.logged.doppler_mps is not None]
-        velocities = None
-        if len(speeds) == len(steps):
-            with contextlib.suppress(NoVelocityError):
-                velocities = SensorVelocities.of(points, speeds, drive.times_s)
-        if velocities is not None:
-            evidence, yaws = sign_significance(drive.scans, velocities.scaled(sign or 1.0), drive.times_s)
+        rig, times_s = _rig_of(steps), np.array([step.time_s for step in steps])
+        drive = Drive([step.scan for step in steps], times_s, None, None, rig=rig)
+        radars = [np.arange(len(steps))] if rig is None else rig.scans_of_radars()
+        measured, gains, yaws = [], [], np.full((2, len(steps) - 1), np.nan)
+        for rows in radars:
+            own = [steps[i] for i in rows]
+            speeds = [step.logged.doppler_mps for step in own if step.logged.doppler_mps is not None]
+            if len(speeds) == len(own) > 1:
+                with contextlib.suppress(NoVelocityError):
+                    found = SensorVelocities.of([step.logged.points for step in own], speeds, times_s[rows])
+                    seen = [step.sensor_scan for step in own]
+                    gain, turned = sign_significance(seen, found.scaled(sign or 1.0), times_s[rows])
+                    measured.append((rows, found))
+                    gains.append(gain)
+                    yaws = turned if rig is None else yaws
+        if measured:
+            evidence = sum(gains) / np.sqrt(len(gains))
             # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Where returns do not show
             # it, as in a tunnel, this one is assumed: each comparison with the returns then states the doubt.
             likelier = sign or int(np.sign(evidence))
             yaws = yaws[::-1] if evidence < 0 else yaws
-            decided = abs(evidence) > CLEAR or len(steps) == _START
+            decided = abs(evidence) > CLEAR or len(steps) == _START * self.num_radars
             sign = sign or (likelier if decided else 0)
             # By the prior alone, a vehicle that turns by 13 degrees between the first scans would be lost.
             known = yaws if turns_fast(yaws[0]) else None
-            drive = dataclasses.replace(drive, velocities=_signed(velocities, likelier), yaws=known)
+            signed = [(rows, _signed(found, likelier)) for rows, found in measured]
+            velocities = signed[0][1] if rig is None else BodyVelocities.of_radars(rig, signed, times_s)
+            drive = dataclasses.replace(drive, velocities=velocities, yaws=known)
         return sign, track_drive(drive, self.config, self.config.num_threads)[1]
+
+
+def _rig_of(steps: Sequence[Step]) -> Rig | None:
+    return rig_of_scans([step.logged for step in steps])
 
 
 def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:

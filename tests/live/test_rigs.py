@@ -1,0 +1,61 @@
+"""Live maps of several radars: tracking of the body, sums at the poses of the radars, and files."""
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig, LiveMap
+from radarsdf.poses.rigid import aligned
+
+from scenes.rigs import drive_of_rig
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return drive_of_rig(radarsdf.simulate.hugin(seed=6, frames=16), seed=2).scans
+
+
+def integrate(live, scans, i, pose=None):
+    return live.integrate(
+        scans.points[i],
+        pose,
+        scans.intensities[i],
+        doppler_mps=scans.doppler_mps[i],
+        time_s=scans.times_s[i],
+        sensor=scans.sensors[i],
+        scan_id=i,
+    )
+
+
+def test_scans_at_poses_of_the_body_are_those_of_a_fit(scans, tmp_path):
+    config = FitConfig.quick()
+    live = LiveMap(config, T_body_sensor=scans.T_body_sensor, folder=tmp_path / "scans", max_bytes=200_000)
+    for i in range(8):
+        integrate(live, scans, i, scans.poses[i])
+    chosen = scans.select(range(8))
+    assert live.map().report["returns"] == radarsdf.fit(chosen, config=config).report["returns"]
+    np.testing.assert_array_equal(
+        live.finish().mesh(0.2).vertices, radarsdf.fit(chosen, config=config).mesh(0.2).vertices
+    )
+    live.save(tmp_path / "live.npz")
+    loaded = LiveMap.load(tmp_path / "live.npz", folder=tmp_path / "others")
+    assert (loaded.mesh().vertices == live.mesh().vertices).all()
+    loaded.remove(3)
+    live.remove(3)
+    assert (loaded.mesh().vertices == live.mesh().vertices).all()
+    more = [integrate(each, scans, 8).pose for each in (loaded, live)]
+    np.testing.assert_allclose(*more, atol=0.05)
+
+
+def test_the_body_is_tracked_by_all_radars(scans):
+    live = LiveMap(T_body_sensor=scans.T_body_sensor)
+    for i in range(len(scans)):
+        integrate(live, scans, i)
+    placed = aligned(np.stack([live.pose(i) for i in range(len(scans))]), scans.poses)
+    assert np.linalg.norm((placed - scans.poses)[:, :3, 3], axis=1).max() < 0.25
+
+
+def test_each_scan_needs_the_label_of_its_radar(scans):
+    with pytest.raises(ValueError, match="sensor must be one of"):
+        LiveMap(T_body_sensor=scans.T_body_sensor).integrate(scans.points[0], np.eye(4))
+    with pytest.raises(ValueError, match="sensor must be one of"):
+        LiveMap().integrate(scans.points[0], np.eye(4), sensor="front")
