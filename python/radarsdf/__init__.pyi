@@ -19,6 +19,9 @@ from .live.live_map import LiveMap as LiveMap
 from .map.map import Map as Map
 from .map.marching_cubes import marching_cubes as marching_cubes
 from .map.radar_map import RadarMap as RadarMap
+from .poses.calibrate import Calibration as Calibration
+from .poses.calibrate import Mounting as Mounting
+from .poses.calibrate import calibrate as calibrate
 from .poses.odometry import Odometry as Odometry
 from .poses.odometry import odometry as odometry
 from .poses.refine import RefinedPoses as RefinedPoses

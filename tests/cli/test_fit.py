@@ -9,6 +9,7 @@ import trimesh
 from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.io import Scans, write_scans
 
+from ..conftest import pose
 from .calls import FAST, QUICK, call, files, refusal, values
 
 
@@ -28,6 +29,23 @@ def test_geometry_only_combines_with_a_preset(scans_file, tmp_path, capsys):
     radar_map = radarsdf.load(path)
     assert not radar_map.has_intensity
     assert radar_map.config == radarsdf.FitConfig.quick()
+
+
+@pytest.mark.parametrize("options", [[], ["--geometry-only"]])
+def test_radars_of_a_rig_are_placed_by_their_mountings(scene, tmp_path, options, capsys):
+    mountings = {"front": pose([1.0, 0, 0.5]), "rear": pose([-1.0, 0.2, 0], np.pi)}
+    labels = ["front", "rear"] * 3
+    body = [T @ np.linalg.inv(mountings[label]) for T, label in zip(scene.poses, labels, strict=True)]
+    rig = Scans(scene.points, np.stack(body), scene.intensities, sensors=labels, T_body_sensor=mountings)
+    write_scans(tmp_path / "rig.npz", rig)
+    assert call("fit", tmp_path / "rig.npz", "-o", tmp_path / "map.safetensors", *QUICK, *options) == 0
+    radar_map = radarsdf.load(tmp_path / "map.safetensors")
+    assert radar_map.has_intensity == (not options)
+    distances = radar_map.sdf(np.concatenate([scan.world_points for scan in rig]))
+    assert np.nanmedian(np.abs(distances)) < 0.1
+    estimated = values(capsys, "fit", tmp_path / "rig.npz", "--dry-run", *options)
+    write_scans(tmp_path / "one.npz", Scans(scene.points, scene.poses, scene.intensities))
+    assert estimated == values(capsys, "fit", tmp_path / "one.npz", "--dry-run", *options)
 
 
 def test_text_and_json_reports_of_a_fit_agree(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -11,11 +12,12 @@ from radarsdf.arrays import Bools, Ints
 from radarsdf.checking import drift, frames, noise, piecewise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
+from radarsdf.checking.mounting import check_mountings, misread_radars
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
-from radarsdf.checks import MISSING_POSES, are_rigid, instance
+from radarsdf.checks import MISSING_POSES, are_rigid, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import measured, too_far
-from radarsdf.scans import Scans, filled
+from radarsdf.scans import Scans, filled, rig_of
 
 _EQUAL = 1e-6  # relative difference of equal ranges, from float32
 # A largest range is too frequent if more than 8 returns, and 5 times as many as at each of the next 10 ranges, have it.
@@ -76,7 +78,24 @@ def check(
     )
     if poses is None:
         raise ValueError(MISSING_POSES)
-    return _find(checked_input(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
+    rig = rig_of(points)
+    if rig is None:
+        return _find(checked_input(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
+    T_world_sensor = rig.sensor_poses(pose_matrices(poses, len(rig.of_scan)))
+    recording = checked_input(scans, T_world_sensor, intensities, doppler_mps, times_s)
+    assert isinstance(points, Scans)
+    of_body = points.with_poses(pose_matrices(poses))
+    mounted = rig.T_body_sensor is not None and are_rigid(T_world_sensor).all()
+    misread = dict(misread_radars(of_body)) if mounted else {}
+    found = list(misread.values())
+    for k, label in enumerate(rig.labels):
+        rows = np.flatnonzero(rig.of_scan == k)
+        if len(rows) and label not in misread:
+            of_radar = _find(recording.select(rows), config, frames.FULL)
+            found += [dataclasses.replace(one, evidence=f"{label}: {one.evidence}") for one in of_radar]
+    if mounted and not any(one.severity == "error" and one.name != "sensor_turned" for one in found):
+        found += check_mountings(of_body, config)
+    return _sorted(found)
 
 
 def check_cheaply(
@@ -107,6 +126,10 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
             found += _drift(recording, numbers, config, found)
+    return _sorted(found)
+
+
+def _sorted(found: list[Finding]) -> list[Finding]:
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
 

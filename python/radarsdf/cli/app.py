@@ -21,7 +21,7 @@ _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
 # Modules of the commands that are not in one of their own name.
 _MODULES = {
     **dict.fromkeys(("demo", "fit"), "fits"),
-    **dict.fromkeys(("check", "poses", "convert"), "scans"),
+    **dict.fromkeys(("check", "poses", "calibrate", "convert"), "scans"),
     **dict.fromkeys(("mesh", "eval", "render"), "maps"),
     **dict.fromkeys(("view", "report"), "pages"),
     **dict.fromkeys(("compare", "grid"), "uses"),

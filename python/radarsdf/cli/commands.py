@@ -11,6 +11,7 @@ COMMANDS = {
     },
     "Poses, recordings and large maps": {
         "poses": ("SCANS [POSES] -o POSES", "Refine the poses of scans, or estimate them from the radar alone."),
+        "calibrate": ("SCANS [POSES] [-o MOUNTINGS]", "Estimate how several radars are mounted, and their time offsets."),
         "live": ("SCANS [POSES]", "Replay a recording into a growing map, and report whether it keeps up."),
         "tiles": ("SCANS [POSES] -o FOLDER", "Fit a map larger than memory in tiles, locally or on a cluster."),
     },
@@ -64,4 +65,4 @@ radarsdf tiles STEP --help lists the options of a step."""
 
 
 def _rows(commands: dict[str, tuple[str, str]]) -> str:
-    return "\n".join(f"  {name:<9}{text}" for name, (_, text) in commands.items())
+    return "\n".join(f"  {name:<11}{text}" for name, (_, text) in commands.items())

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 
 import radarsdf
 from radarsdf import Interrupted, RadarMap
-from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split
+from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split, without_intensities
 from radarsdf.cli.maps import evaluate, mesh
 from radarsdf.cli.options import LIMITS, Parser, refuse_if
 from radarsdf.cli.pages import add_report
@@ -42,23 +42,15 @@ def fit(given: Namespace, results: Results) -> None:
     every_scan, posed = posed_scans(given, config, results, refine=given.refine)
     config = posed.config(config)
     scans, held_out = split(every_scan, given.holdout)
-    intensities = None if given.geometry_only else scans.intensities
+    used = without_intensities(scans) if given.geometry_only else scans
     if out is None:
-        expected = radarsdf.estimate(scans.points, scans.poses, intensities, config=config)
+        expected = radarsdf.estimate(used.points, used.sensor_poses, used.intensities, config=config)
         results.add(str(expected), **vars(expected))
         return
     if not given.no_check:
-        warn_or_refuse(scans, intensities)
+        warn_or_refuse(used)
     try:
-        radar_map = radarsdf.fit(
-            scans.points,
-            scans.poses,
-            intensities,
-            doppler_mps=scans.doppler_mps,
-            config=config,
-            progress=results.progress,
-            checkpoint=given.checkpoint,
-        )
+        radar_map = radarsdf.fit(used, config=config, progress=results.progress, checkpoint=given.checkpoint)
     except Interrupted as stop:
         if stop.radar_map is not None:
             stop.radar_map.save(out)

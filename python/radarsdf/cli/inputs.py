@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from argparse import Namespace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
 from radarsdf.io.text import read_numbers
 from radarsdf.map.map import Map
-from radarsdf.scans import Scans
+from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import lacking, load
 from radarsdf.view.serving import free_port, require_viser
 
@@ -71,6 +73,12 @@ def scans_if(wanted: object, given: Namespace) -> Scans | None:
         value = vars(given)[option.lstrip("-").replace("-", "_")]
         refuse_if(value not in (None, MAX_GAP_S), f"no scans are read: {option} {value} would have no effect")
     return read_scans(given) if wanted else None
+
+
+def without_intensities(scans: Scans) -> Scans:
+    """Leave out the intensities."""
+    without = partial(dataclasses.replace, intensities=None)
+    return Scans.of_source(lambda: map(without, scans), Notes(), mountings=lambda: scans.T_body_sensor)
 
 
 def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:

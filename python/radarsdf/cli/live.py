@@ -52,6 +52,7 @@ def replay(
     done, count = Replay(), len(scans.points)
     times_s = scans.times_s if scans.times_s is not None else 0.1 * np.arange(count)
     due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
+    labels = None if scans.T_body_sensor is None else scans.sensors
     begin = time.perf_counter()
     for i in range(count):
         now = time.perf_counter() - begin
@@ -68,6 +69,7 @@ def replay(
                 doppler_mps=None if scans.doppler_mps is None else scans.doppler_mps[i],
                 time_s=float(times_s[i]),
                 scan_id=i,
+                sensor=None if labels is None else labels[i],
             )
         except Lost:
             done.lost.append(i)
@@ -98,7 +100,7 @@ def live(given: Namespace, results: Results) -> None:
     check(timed, f"{given.scans}: scans without poses need times, one per scan")
     if trajectory is not None:
         check_pose_times(trajectory, scans.times_s)
-    growing = LiveMap(load_config(given))
+    growing = LiveMap(load_config(given), T_body_sensor=scans.T_body_sensor)
     with contextlib.ExitStack() as stack:
         shown = None
         if given.view:

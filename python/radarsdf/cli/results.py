@@ -51,16 +51,17 @@ class Results:
         """Print the JSON object, if there is one. Non-finite numbers become null."""
         if self.json and not self._ended:
             self._ended = True
-            print(json.dumps(_plain(self._values), indent=2, allow_nan=False), flush=True)
+            print(json.dumps(plain(self._values), indent=2, allow_nan=False), flush=True)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Convert to what JSON can store; non-finite numbers become null."""
     if hasattr(value, "tolist"):  # an array or a number of NumPy
         value = value.tolist()
     if isinstance(value, dict):
-        return {str(name): _plain(part) for name, part in value.items()}
+        return {str(name): plain(part) for name, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
+        return [plain(part) for part in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
-from numpy.typing import NDArray
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 import radarsdf
 from radarsdf import FitConfig
@@ -15,7 +16,7 @@ from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
 from radarsdf.cli.inputs import inputs_of, read_scans, scans_if, scans_or_unposed
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, warn
+from radarsdf.cli.results import Results, plain, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
 from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
@@ -38,9 +39,9 @@ def check(given: Namespace, results: Results) -> int:
     return int(any(finding.severity == "error" for finding in findings))
 
 
-def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None:
+def warn_or_refuse(scans: Scans) -> None:
     """Print warnings of the cheap checks before a fit. Raises a ValueError if a map of the scans would be nonsense."""
-    for finding in check_cheaply(scans.points, scans.poses, intensities):
+    for finding in check_cheaply(scans.points, scans.sensor_poses, scans.intensities):
         what = f"{finding.name}: {finding.evidence} {finding.fix} --no-check fits the scans as they are"
         check_that(finding.severity != "error", what)
         if finding.severity == "warning":
@@ -70,6 +71,8 @@ def poses(given: Namespace, results: Results) -> None:
     if picture is not None:
         given_poses = {} if posed.given is None else {"given": posed.given}
         drawn = given_poses | {"refined" if given_poses else "found": scans.poses}
+        if scans.rig is not None:
+            drawn = {name: scans.rig.sensor_poses(poses) for name, poses in drawn.items()}
         save_trajectory_picture(picture, scans.points, drawn)
         results.add(f"picture written to {picture}", picture=picture)
 
@@ -112,6 +115,52 @@ def posed_scans(
         error = f"{report['sigma_m']:.3f} m and {sigma_deg:.2f} degrees"
         results.add(f"they moved by {moved}; the input's step error is {error}")
     return scans.with_poses(refined.poses), PosedScans.refined(refined, scans.poses)
+
+
+def calibrate(given: Namespace, results: Results) -> None:
+    """Estimate the mountings of the radars, print them with deviations, and write them."""
+    if given.out is not None:
+        checked_suffix(given.out, (".json",), "mountings to write")
+    check_outputs([given.out], inputs_of(given))
+    found = radarsdf.calibrate(scans_or_unposed(given)[0], config=load_config(given))
+    for note in found.notes:
+        warn(f"note: {note}")
+    results.add(
+        f"mountings relative to that of {found.against}; deviations in brackets", against=found.against
+    )
+    of_imu = {} if found.imu is None else {"IMU": found.imu}
+    mountings = {str(label): mounting for label, mounting in found.mountings.items()} | of_imu
+    rows = [["radar", "x, y, z, m", "yaw, pitch, roll, degrees", "time offset, ms"]]
+    for label, one in mountings.items():
+        sigmas = np.sqrt(one.covariance.diagonal())
+        R = one.T_body_sensor[:3, :3]
+        angles = (
+            Rotation.from_matrix(R).as_euler("ZYX", degrees=True)
+            if np.isfinite(R).all()
+            else np.full(3, np.nan)
+        )
+        parts = (
+            (one.T_body_sensor[:3, 3], sigmas[:3], 3),
+            (angles, np.degrees(sigmas[:2:-1]), 2),
+            ([1e3 * one.time_offset_s], [1e3 * one.time_offset_sigma_s], 1),
+        )
+        cells = [
+            " ".join(
+                f"{value:.{digits}f} ({sigma:.{digits}f})"
+                for value, sigma in zip(values, deviations, strict=True)
+            )
+            for values, deviations, digits in parts
+        ]
+        rows.append([label, *cells])
+    results.table(rows)
+    for label, one in mountings.items():
+        for why in one.unobserved:
+            results.add(f"{label}: not observed: {why}")
+    values = {label: vars(one) for label, one in mountings.items()}
+    results.add(mountings=values)
+    if given.out is not None:
+        given.out.write_text(json.dumps(plain(values), indent=2) + "\n", encoding="utf-8")
+        results.add_file(f"{len(values)} mountings", given.out)
 
 
 def convert(given: Namespace, results: Results) -> None:

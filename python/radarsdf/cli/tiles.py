@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import multiprocessing
 from argparse import Namespace
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 
-from radarsdf.cli.inputs import mesh_limits, read_scans
+from radarsdf.cli.inputs import mesh_limits, read_scans, without_intensities
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, warn
 from radarsdf.cli.scans import warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
-from radarsdf.scans import Notes, Scans, scans_in_memory
+from radarsdf.scans import scans_in_memory
 from radarsdf.tiles.fit_tiles import cluster_executor, plan_tiles, run_fits
 from radarsdf.tiles.mesh import voxels_along
 from radarsdf.tiles.plan import Plan, failure_of, is_done
@@ -43,12 +41,9 @@ def plan(given: Namespace, results: Results) -> None:
     if not given.no_check:  # with wrong poses, a city would waste hours
         first = list(itertools.islice(iter(scans), _FIRST_SCANS))
         if len(first) > 1:
-            some = scans_in_memory(first)
-            warn_or_refuse(some, some.intensities)
-    without = partial(dataclasses.replace, intensities=None)
-    used = Scans.of_source(lambda: map(without, scans), Notes(str(given.scans)))
+            warn_or_refuse(scans_in_memory(first))
     planned = plan_tiles(
-        used if given.geometry_only else scans,
+        without_intensities(scans) if given.geometry_only else scans,
         given.out,
         tile_size=given.tile_size,
         halo=given.halo,
