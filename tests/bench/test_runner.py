@@ -12,6 +12,7 @@ from radarsdf.render.picture import save_picture
 from bench import runner
 from bench.paper.__main__ import EXPERIMENTS
 from bench.peers.interface import Reconstruction
+from bench.rigs import EXPERIMENTS as RIGS
 from bench.runner import Column, Experiment
 from scenes.scene import load_scene
 from scenes.settings import parsed, words_of
@@ -193,3 +194,9 @@ def test_tables_keep_scenes_without_intensities_or_ground_truth(tmp_path):
         assert "no intensities" in run(tmp_path, experiment, str(path))[0]
     for experiment in ("surface", "ranges", "calibration"):
         assert "no ground truth" in run(tmp_path, experiment, str(path))[0]
+
+
+def test_a_rig_whose_recording_is_absent_is_listed(tmp_path):
+    runner.main("bench.rigs", RIGS, ["motorway", "nowhere.npz", "--quick", "--out", str(tmp_path)])
+    (row,) = json.loads((tmp_path / "rigs-motorway.json").read_text())["rows"]
+    assert "no such file" in row["why_not"]
