@@ -282,11 +282,10 @@ void before_the_training(int threads, Results& results) {
     of_return[static_cast<std::size_t>(i)] = static_cast<std::int32_t>(i % (kPlanes + 1) - 1);
   }
   std::vector<float> moved(7 * kPoints);
-  radarsdf::move_onto_planes(
-      {points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), nullptr, kPoints, up.data(),
-       noise.data()},
-      {planes.data(), planes.data() + 3 * kPlanes, planes.data() + 6 * kPlanes, kPlanes},
-      {moved.data(), moved.data() + 3 * kPoints, moved.data() + 6 * kPoints}, threads);
+  radarsdf::move_onto_planes({points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), nullptr,
+                              kPoints, up.data(), noise.data()},
+                             {planes.data(), planes.data() + 3 * kPlanes, planes.data() + 6 * kPlanes, kPlanes},
+                             {moved.data(), moved.data() + 3 * kPoints, moved.data() + 6 * kPoints}, threads);
   results.add(moved.data(), 7 * kPoints);
 }
 
