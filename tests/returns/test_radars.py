@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf._core import QUANTA, GrowingSums, SumsChange
 from radarsdf.map import storage
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.planes import Surfels
@@ -82,12 +81,6 @@ def test_weighted_sums_have_the_moments_of_repeated_returns():
     sums, expected = ScanSums.of_cells(rays, cells, 0.2, weights=weights), ScanSums.of(again, 0.2)
     assert (sums.sums == expected.sums).all()
     assert (WEIGHT_UNIT * sums.counts == expected.counts).all()
-    change, growing = SumsChange(0.2, 0.2 / QUANTA), GrowingSums()
-    for scan in range(6):
-        own = rays.select(rays.scans == scan)
-        change.collect(own.points, own.directions, own.ranges_m, 1, 2 if scan < 3 else 1)
-    growing.apply(change)
-    assert (growing.sums_of(growing.block_keys())[1] == expected.sums).all()
     assert (WEIGHT_UNIT * sums.merged_moments()[1] == expected.merged_moments()[1]).all()
 
 
