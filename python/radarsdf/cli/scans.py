@@ -21,7 +21,7 @@ from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
 from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
 from radarsdf.io.clouds import CLOUD_SUFFIXES
-from radarsdf.io.files import check_outputs, checked_suffix
+from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 from radarsdf.io.meshes import MESH_SUFFIXES, holds_mesh, read_mesh, write_mesh
 from radarsdf.io.npz import write_scans
 from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
@@ -159,7 +159,7 @@ def calibrate(given: Namespace, results: Results) -> None:
     values = {label: vars(one) for label, one in mountings.items()}
     results.add(mountings=values)
     if given.out is not None:
-        given.out.write_text(json.dumps(plain(values), indent=2) + "\n", encoding="utf-8")
+        write_whole(given.out, f"{json.dumps(plain(values), indent=2)}\n".encode())
         results.add_file(f"{len(values)} mountings", given.out)
 
 
