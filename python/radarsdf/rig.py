@@ -23,6 +23,11 @@ class Mounted(NamedTuple):
     T_body_sensor: Floats  # (4, 4) m
 
 
+def checked_mountings(T_body_sensor: Mapping[Any, ArrayLike]) -> dict[Label, Floats]:
+    """Convert mountings by label to rigid transforms (4, 4), m. Raise a ValueError if one is none."""
+    return {label: check_pose(T, f"T_body_sensor of {label!r:.50}") for label, T in T_body_sensor.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Radars of F scans.
@@ -48,8 +53,7 @@ class Rig:
         rows = np.array([row[label] for label in of_scan], np.int32)
         if T_body_sensor is None:
             return cls(labels, rows, None)
-        mountings = [check_pose(T, f"T_body_sensor of {label!r:.50}") for label, T in T_body_sensor.items()]
-        return cls(labels, rows, np.stack(mountings))
+        return cls(labels, rows, np.stack([*checked_mountings(T_body_sensor).values()]))
 
     @property
     def sensors(self) -> list[Label]:
@@ -82,9 +86,9 @@ class Rig:
         """Transform scans (N_i, 3) from the frame of the body to those of their radars, m."""
         return [(scan - T[:3, 3]) @ T[:3, :3] for scan, T in zip(scans, self.mountings, strict=True)]
 
-    def scans_of_radars(self) -> list[Ints]:
-        """Scans of each of the radars that have any."""
-        return [np.flatnonzero(self.of_scan == i) for i in np.unique(self.of_scan)]
+    def scans_of_radars(self) -> dict[Label, Ints]:
+        """Scans of each of the radars that have any, by its label."""
+        return {self.labels[i]: np.flatnonzero(self.of_scan == i) for i in np.unique(self.of_scan)}
 
     def select(self, rows: slice | Ints | Sequence[int]) -> Rig:
         """Select scans."""

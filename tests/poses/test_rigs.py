@@ -54,7 +54,7 @@ def turning_body(count=9, turn_rad_s=0.4, speed_mps=10.0, interval_s=0.05):
     velocities = np.array([speed_mps, 0.0, 0.0]) + np.cross([0.0, 0.0, turn_rad_s], levers)
     velocities = np.einsum("fji,fj->fi", rig.mountings[:, :3, :3], velocities)
     measured = []
-    for rows in rig.scans_of_radars():
+    for rows in rig.scans_of_radars().values():
         covariance = np.tile(1e-4 * np.eye(3), (len(rows), 1, 1))
         masks = [np.ones(3, bool)] * len(rows)
         of_radar = SensorVelocities(

@@ -88,9 +88,8 @@ def check(
     mounted = rig.T_body_sensor is not None and are_rigid(T_world_sensor).all()
     misread = dict(misread_radars(of_body)) if mounted else {}
     found = list(misread.values())
-    for k, label in enumerate(rig.labels):
-        rows = np.flatnonzero(rig.of_scan == k)
-        if len(rows) and label not in misread:
+    for label, rows in rig.scans_of_radars().items():
+        if label not in misread:
             of_radar = _find(recording.select(rows), config, frames.FULL)
             found += [dataclasses.replace(one, evidence=f"{label}: {one.evidence}") for one in of_radar]
     if mounted and not any(one.severity == "error" and one.name != "sensor_turned" for one in found):

@@ -28,7 +28,7 @@ from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Limits
 from radarsdf.returns.moving import MovingReturns
 from radarsdf.returns.rays import check_scans
-from radarsdf.rig import Label, Mounted
+from radarsdf.rig import Label, Mounted, checked_mountings
 from radarsdf.scans import Scans
 
 if TYPE_CHECKING:
@@ -127,11 +127,7 @@ class LiveMap:
             unlock = weakref.finalize(self, os.close, locked_folder(place))
             if hasattr(os, "register_at_fork"):  # a child process would hold the lock, too
                 os.register_at_fork(after_in_child=unlock)
-        mountings = None
-        if T_body_sensor is not None:
-            mountings = {
-                label: check_pose(T, f"T_body_sensor of {label!r:.50}") for label, T in T_body_sensor.items()
-            }
+        mountings = None if T_body_sensor is None else checked_mountings(T_body_sensor)
         self._state = GrowingState(config, corner, most, place, mountings)
         self._follower = Follower(config, num_radars=max(len(mountings or ()), 1))
         self._pid = os.getpid()
@@ -355,13 +351,12 @@ class LiveMap:
         """
         described, scans, sums = load_state(path)
         config = FitConfig.from_dict(described.config)
-        mountings = described.T_body_sensor
         live = cls(
             config,
             origin=described.origin,
             max_bytes=described.max_bytes,
             folder=folder,
-            T_body_sensor=mountings,
+            T_body_sensor=described.T_body_sensor,
         )
         live._state.restore(described, scans, sums)
         for scan_id, scan in zip(described.ids, scans, strict=True):

@@ -21,7 +21,7 @@ from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.regions import REGION_BITS
 from radarsdf.returns.evidence import BLOCK_BITS
-from radarsdf.rig import Label, Mounted, Rig
+from radarsdf.rig import Label, Mounted, Rig, checked_mountings
 
 ScanId = Hashable
 # Arrays of a scan, and their types.
@@ -301,16 +301,13 @@ class Described(BaseModel):
     ids: list[int | str]
     poses: list[list[list[float]]]  # T_world_sensor, m, of the scans in `ids`
     times_s: list[float | None]
-    mountings: list[tuple[int | str, list[list[float]]]] | None = (
-        None  # T_body_sensor, m, of the radars of a rig
-    )
+    # T_body_sensor, m, of the radars of a rig by label, and the number of that of each scan in `ids`.
+    mountings: list[tuple[int | str, list[list[float]]]] | None = None
     radars: list[int] = []
 
     @property
     def T_body_sensor(self) -> dict[Label, Floats] | None:
-        if self.mountings is None:
-            return None
-        return {label: check_pose(T, f"T_body_sensor of {label!r:.50}") for label, T in self.mountings}
+        return None if self.mountings is None else checked_mountings(dict(self.mountings))
 
 
 def save_state(

@@ -81,10 +81,10 @@ class Step:
         """(N, 3) static returns, sensor frame, m."""
         return np.ascontiguousarray(self.logged.static.points, np.float64)
 
-    @cached_property
+    @property
     def scan(self) -> Floats:
         """(N, 3) static returns, frame of the poses, m."""
-        rig = rig_of_scans([self.logged])
+        rig = _rig_of([self])
         return self.sensor_scan if rig is None else rig.in_body([self.sensor_scan])[0]
 
     @cached_property
@@ -343,7 +343,7 @@ class Follower:
         if (rig := _rig_of(steps)) is None:
             return velocities
         measured = np.array([step.velocity is not None for step in steps])
-        parts = [rows[measured[rows]] for rows in rig.scans_of_radars()]
+        parts = [rows[measured[rows]] for rows in rig.scans_of_radars().values()]
         radars = [(rows, velocities.select(rows)) for rows in parts if len(rows)]
         return BodyVelocities.of_radars(rig, radars, np.array([step.time_s for step in steps]))
 
@@ -378,7 +378,7 @@ class Follower:
         """Return the sign of the Doppler, 0 if not significant, and the scans tracked by odometry, in the frame of the first."""
         rig, times_s = _rig_of(steps), np.array([step.time_s for step in steps])
         drive = Drive([step.scan for step in steps], times_s, None, None, rig=rig)
-        radars = [np.arange(len(steps))] if rig is None else rig.scans_of_radars()
+        radars = [np.arange(len(steps))] if rig is None else [*rig.scans_of_radars().values()]
         measured, gains, yaws = [], [], np.full((2, len(steps) - 1), np.nan)
         for rows in radars:
             own = [steps[i] for i in rows]

@@ -116,17 +116,20 @@ class BodyVelocities(SensorVelocities):
         assert levers is not None
         body_mps = mean_mps[rows] + np.einsum("fij,fj->fi", levers[rows], rates)
         off = self.of_radars_mps[:, rows] - body_mps + np.einsum("kij,fj->kfi", self.levers, rates)
-        information = np.linalg.inv(self.variances[:, rows])
+        information = self._information[:, rows]
         sums = np.einsum("kfij,kfj->ki", information, off)
         biases = np.linalg.solve(information.sum(axis=1), sums[:, :, None])[:, :, 0]
         return dataclasses.replace(self, of_radars_mps=self.of_radars_mps - biases[:, None], agree=True)
 
     @cached_property
+    def _information(self) -> Floats:
+        return np.asarray(np.linalg.inv(self.variances), np.float64)
+
+    @cached_property
     def _weights(self) -> tuple[Floats, Floats]:
         """Weights (K, F - 1, 3, 3) of the radars in the velocity of a step, and its covariances (F - 1, 3, 3)."""
-        information = np.linalg.inv(self.variances)
-        variances = np.linalg.inv(information.sum(axis=0))
-        return variances @ information, variances
+        variances = np.linalg.inv(self._information.sum(axis=0))
+        return variances @ self._information, variances
 
     @cached_property
     def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
@@ -147,7 +150,7 @@ class BodyVelocities(SensorVelocities):
         if duration_s == 0 or not self.agree:
             return turn
         apart = (self.levers - levers[i]) / duration_s
-        information = np.linalg.inv(self.variances[:, i])
+        information = self._information[:, i]
         off = mean_mps[i] - self.of_radars_mps[:, i] - apart @ turn.mean
         # In the information form, of a turn that may be known exactly.
         total = np.einsum("kji,kjl,klm->im", apart, information, apart)

@@ -95,7 +95,7 @@ class CheckedScans:
         given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         times_s = None if times is None else _checked_times(times, len(given))
         radars = []
-        for rows in rig.scans_of_radars():
+        for rows in rig.scans_of_radars().values():
             own_s = None if times_s is None else times_s[rows]
             checked = cls.of([given[i] for i in rows], chosen(doppler_mps, rows), own_s)
             if checked.times_s is not None and times_s is not None:

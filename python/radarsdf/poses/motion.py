@@ -94,7 +94,7 @@ Priors = tuple[MotionPrior, MotionPrior]  # translation, rotation
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats) -> Floats:
     """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
     and linearly changing velocity."""
-    middle = np.einsum("...ij,...j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
+    middle = turned_halfway(turn, 0.5 * (begin_mps + end_mps))
     end = np.einsum("...ij,...j->...i", rotation(turn), end_mps)
     return duration_s / 6 * (begin_mps + 4 * middle + end)
 
@@ -114,7 +114,7 @@ class PredictedStep:
     translation_covariance: Floats  # (3, 3) of the translation given the turn, m²
     duration_s: float
     lever: Floats | None = (
-        None  # (3, 3) derivative of the translation by the turn, of velocities of other points, m
+        None  # (3, 3) derivative of the translation by the turn, if radars have lever arms, m
     )
 
     def pose(self, turn: Floats | None = None) -> Floats:

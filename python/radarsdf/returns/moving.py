@@ -207,9 +207,9 @@ class MovingReturns:
         if rig is None:
             return cls.of(points, doppler_mps)
         masks, why = [np.zeros(0, bool)] * len(rig.of_scan), list[str]()
-        for rows in rig.scans_of_radars():
+        for label, rows in rig.scans_of_radars().items():
             own = cls.of([points[i] for i in rows], [doppler_mps[i] for i in rows])
-            why += [] if own.why_none is None else [f"{rig.labels[rig.of_scan[rows[0]]]}: {own.why_none}"]
+            why += [] if own.why_none is None else [f"{label}: {own.why_none}"]
             for i, mask in zip(rows.tolist(), own.masks, strict=True):
                 masks[i] = mask
         return cls(masks, "; ".join(why) or None)
