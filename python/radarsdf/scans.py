@@ -257,13 +257,14 @@ class Scans:
 
         Negative indices count from the end. Ground truth and IMU stay the same. Raises an IndexError if one is out of range.
         """
-        scans = self.with_poses(self.poses[frames])
-        scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
+        arrays = {name: chosen(values, frames) for name, values in self._loaded().items()}
+        scans = self.with_poses(None if self._poses is None else self._poses[frames])
+        scans._arrays = arrays
         scans._times_s = None if self._times_s is None else self._times_s[frames]
         scans._rig = None if self._rig is None else self._rig.select(frames)
         return scans
 
-    def with_poses(self, poses: Floats, *, other_world: bool = False) -> Scans:
+    def with_poses(self, poses: Floats | None, *, other_world: bool = False) -> Scans:
         """Return the same scans with other `poses` (F, 4, 4) float64, m. All scans are read.
 
         `other_world`: whether these are in another world frame than the ground truth, which is then dropped.

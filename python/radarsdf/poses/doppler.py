@@ -14,7 +14,12 @@ from radarsdf.arrays import Array, Bools, Floats, Ints
 from radarsdf.poses.motion import KnownMotion, MotionRate, spans_of, turned_halfway, usual_duration_s, way
 from radarsdf.poses.rigid import rotation, rotation_vector, step_vectors, steps
 from radarsdf.products import normal_matrix
-from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, folding_interval_mps, sensor_velocities
+from radarsdf.returns.moving import (
+    MIN_DOPPLER_RETURNS,
+    SensorVelocity,
+    folding_interval_mps,
+    sensor_velocities,
+)
 
 _SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
 _FEW_SAMPLED = 100  # returns of a scan, where many pairs are compared
@@ -61,6 +66,7 @@ class SensorVelocities:
     common_sigma: float = _IN_COMMON
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
+    of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
 
     @classmethod
     def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> SensorVelocities:
@@ -90,7 +96,7 @@ class SensorVelocities:
             mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
             away_s = np.abs(at - times_s[i]).min()
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
-        return cls(mean, covariance, change, static, found, climb_assumed=weak)
+        return cls(mean, covariance, change, static, found, climb_assumed=weak, of_scans=each)
 
     def select(self, rows: slice | Ints) -> SensorVelocities:
         """Select scans."""

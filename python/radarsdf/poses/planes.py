@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -133,8 +133,10 @@ class SensorReturns:
         positions = (poses[:, :3, 3] - origin).astype(np.float32)
         points = directions * self.ranges_m[:, None] + positions[self.scans]
         up = poses[:, :3, 2].copy()
-        sensors = None if self.rig is None else self.rig.of_scan
-        return Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self), sensors)
+        rays = Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self))
+        if self.rig is None:
+            return rays
+        return replace(rays, sensor_of_scan=self.rig.of_scan, num_sensors=len(self.rig.labels))
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ def common_planes(
         np.concatenate(centres),
         np.ascontiguousarray(np.concatenate(normals)),
         grid.cell_m,
-        known.variances,
+        known.of_scans(rays),
         min(grid.window, _TOGETHER),
         num_threads,
     )
