@@ -332,16 +332,18 @@ def scans_in_memory(scans: Sequence[Scan]) -> Scans:
 
 
 def filled(points: Any, **given: Any) -> tuple[Any, ...]:
-    """Fill missing arrays from `points`, if these are `Scans`; arrays are named as in :class:`Scans`."""
-    if not isinstance(points, Scans):
-        return points, *given.values()
-    arrays = points.points  # first, since it reads everything in one pass
-    return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
+    """Return the rig, the scans and the values `given` by names of :class:`Scans`, if `points` are those; else no rig.
 
-
-def rig_of(points: Any) -> Rig | None:
-    """Return the radars of `points`, if these are `Scans` of several."""
-    return points.rig if isinstance(points, Scans) else None
+    Missing values are those of the `Scans`. Raises a ValueError if poses are missing.
+    """
+    rig = None
+    if isinstance(points, Scans):
+        scans, points = points, points.points  # reads everything in one pass
+        rig = scans.rig
+        given = {name: getattr(scans, name) if values is None else values for name, values in given.items()}
+    if given.get("poses", points) is None:
+        raise ValueError(MISSING_POSES)
+    return rig, points, *given.values()
 
 
 def chosen(arrays: Sequence[Any] | None, numbers: Ints | Sequence[int]) -> list[Any] | None:

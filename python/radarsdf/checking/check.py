@@ -14,10 +14,10 @@ from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.mounting import check_mountings, misread_radars
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
-from radarsdf.checks import MISSING_POSES, are_rigid, instance, pose_matrices
+from radarsdf.checks import are_rigid, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import measured, too_far
-from radarsdf.scans import Scans, filled, rig_of
+from radarsdf.scans import Scans, filled
 
 _EQUAL = 1e-6  # relative difference of equal ranges, from float32
 # A largest range is too frequent if more than 8 returns, and 5 times as many as at each of the next 10 ranges, have it.
@@ -73,12 +73,9 @@ def check(
     ('poses_inverted', 'error')
     """
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    scans, poses, intensities, doppler_mps, times_s = filled(
+    rig, scans, poses, intensities, doppler_mps, times_s = filled(
         points, poses=poses, intensities=intensities, doppler_mps=doppler_mps, times_s=times_s
     )
-    if poses is None:
-        raise ValueError(MISSING_POSES)
-    rig = rig_of(points)
     if rig is None:
         return _find(checked_input(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
     T_world_sensor = rig.sensor_poses(pose_matrices(poses, len(rig.of_scan)))

@@ -29,7 +29,7 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
         yield Finding("intensity_is_doppler", "error", evidence)
     if recording.doppler_mps is None:
         return
-    scans, velocities = _velocities(recording, recording.doppler_mps)
+    scans, velocities = velocities_of_some(recording, recording.doppler_mps)
     good = np.array([velocity.found for velocity in velocities], bool)
     tried, without = len(scans), int((~good).sum())
     if tried - without < max(_MIN_SCANS, tried // 2):
@@ -47,7 +47,7 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
     yield from _compared_with_poses(recording, scans[good], by_doppler)
 
 
-def _velocities(recording: Scans, values: list[Array]) -> tuple[Ints, list[SensorVelocity]]:
+def velocities_of_some(recording: Scans, values: list[Array]) -> tuple[Ints, list[SensorVelocity]]:
     """Velocities of some scans from `values`, which may be Doppler, and the scans."""
     scans = [i for i in some_scans(recording) if len(recording.points[i]) >= MIN_DOPPLER_RETURNS]
     found = sensor_velocities([recording.points[i] for i in scans], [values[i] for i in scans])
@@ -58,7 +58,7 @@ def _are_speeds(recording: Scans, values: list[Array]) -> bool:
     """Whether values (N_i,) of the scans are Doppler: most scans fit a velocity, which is not zero in all."""
     if min(float(np.min(value, initial=0)) for value in values) >= 0:
         return False  # Doppler has both signs, or a negative one for approaching returns
-    scans, velocities = _velocities(recording, values)
+    scans, velocities = velocities_of_some(recording, values)
     found = [velocity.velocity_mps for velocity in velocities if velocity.found]
     if len(scans) < _MIN_SCANS or len(found) < 0.7 * len(scans):
         return False

@@ -159,6 +159,7 @@ class BodyVelocities(SensorVelocities):
         return MotionRate(turn.mean + covariance @ gradient, covariance)
 
     def measure_turns(self, durations_s: Floats, least: float) -> bool:
+        """Whether these velocities remove at least this share of the variance of yaws between scans."""
         usual = MotionRate(np.zeros(3), _TURN_RAD_S**2 * np.eye(3))
         steps = [(i, usual.integrate(d), d) for i, d in enumerate(durations_s.tolist()) if d > 0]
         left = [self.turn_given(turn, i, d).covariance[2, 2] / turn.covariance[2, 2] for i, turn, d in steps]

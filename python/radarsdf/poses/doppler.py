@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
-from radarsdf.poses.motion import KnownMotion, MotionRate, spans_of, turned_halfway, usual_duration_s, way
+from radarsdf.poses.motion import KnownMotion, spans_of, turned_halfway, usual_duration_s, way
 from radarsdf.poses.rigid import rotation, rotation_vector, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import (
@@ -121,18 +121,6 @@ class SensorVelocities:
     def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
         """Velocities at the beginning and the end of steps, (F - 1, 3) each, and derivatives by turn rates, (F - 1, 3, 3) m."""
         return self.mean_mps[:-1], self.mean_mps[1:], None
-
-    def learnt(self, turn_rates: Sequence[MotionRate | None]) -> SensorVelocities:  # noqa: ARG002 - for several radars
-        """Return velocities whose systematic errors are estimated from turn rates (F - 1), rad/s; None: unknown."""
-        return self
-
-    def measure_turns(self, durations_s: Floats, least: float) -> bool:  # noqa: ARG002 - for several radars
-        """Whether these velocities remove at least this share of the variance of yaws between scans."""
-        return False
-
-    def turn_given(self, turn: MotionRate, i: int, duration_s: float) -> MotionRate:  # noqa: ARG002 - for several radars
-        """Return a turn in the step from scan `i` given these velocities, rad."""
-        return turn
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
         """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
