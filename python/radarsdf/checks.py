@@ -164,7 +164,6 @@ def are_rigid(poses: Floats) -> Bools:
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:
-    """Return `value` if it is an instance of `kind`, else raise a TypeError."""
     if not isinstance(value, kind):
         raise _wrong_type(name, f"a {kind.__name__}", value)
     return value
@@ -179,14 +178,12 @@ def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
 
 
 def path_of(value: Any, name: str) -> Path:
-    """Convert to a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise _wrong_type(name, "a path", value)
     return Path(value)
 
 
 def flag(value: Any, name: str) -> bool:
-    """Convert to a bool."""
     if not isinstance(value, (bool, np.bool_)):
         raise _wrong_type(name, "True or False", value)
     return bool(value)

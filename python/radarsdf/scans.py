@@ -68,12 +68,8 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
         return scan
     what = "returns left out: a coordinate or the intensity is not a finite number"
     notes.count(what, int((~finite).sum()))
-    columns = {
-        "points": points,
-        "intensities": intensities,
-        "doppler_mps": scan.doppler_mps,
-        "sigma": scan.sigma,
-    }
+    names = ("points", "intensities", "doppler_mps", "sigma")
+    columns = {name: getattr(scan, name) for name in names}
     kept: dict[str, Any] = {name: array[finite] for name, array in columns.items() if array is not None}
     return dataclasses.replace(scan, **kept)
 

@@ -146,9 +146,8 @@ class Changes:
         faces = np.concatenate([self.after.faces, lost + np.int32(len(self.after.vertices))])
         mesh: Any = trimesh.Trimesh(vertices, faces, process=False)
         for name in ("kind", "probability", "moved_m", "intensity_change"):
-            mesh.vertex_attributes[name] = np.concatenate(
-                [getattr(self.after, name), getattr(self.before, name)[used]]
-            )
+            after, before = (getattr(side, name) for side in (self.after, self.before))
+            mesh.vertex_attributes[name] = np.concatenate([after, before[used]])
         mesh.visual.vertex_colors = colors_of(mesh.vertex_attributes["kind"])
         return mesh
 
@@ -161,10 +160,8 @@ class Changes:
 
 def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
     kinds, areas_m2 = (np.concatenate(of) for of in zip(*(s.of_faces() for s in surfaces), strict=True))
-    return {
-        "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},
-        "compared_m2": float(areas_m2[kinds != UNSEEN].sum()),
-    }
+    of_kinds = {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED}
+    return {"areas_m2": of_kinds, "compared_m2": float(areas_m2[kinds != UNSEEN].sum())}
 
 
 def colors_of(kinds: NDArray[np.int8]) -> Bytes:

@@ -174,9 +174,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         recording = _without(recording, left_out)
     empty = np.array([mask.all() for mask in left_out])
     if empty.any():
-        evidence = (
-            f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
-        )
+        evidence = f"{empty.sum()} of {len(empty)} scans have no returns, the first is {np.argmax(empty)}."
         found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
     if not empty.all():
         found += trajectory.check_rigid(recording)
@@ -187,10 +185,8 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
 
 def _far(recording: Scans, returns: list[Bools], num_far: int) -> Iterator[Finding]:
     """Report returns that a fit leaves out as too far away, and a farthest range that is much too frequent."""
-    lengths = [
-        np.linalg.norm(scan[mask], axis=1) for scan, mask in zip(recording.points, returns, strict=True)
-    ]
-    ranges = np.concatenate(lengths)
+    pairs = zip(recording.points, returns, strict=True)
+    ranges = np.concatenate([np.linalg.norm(scan[mask], axis=1) for scan, mask in pairs])
     most = ranges.max(initial=0.0)
     counts = np.unique((np.log(ranges / most) / _EQUAL).round(), return_counts=True)[1]
     if num_far:

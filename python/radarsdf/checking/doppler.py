@@ -34,9 +34,7 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
     tried, without = len(scans), int((~good).sum())
     if tried - without < max(_MIN_SCANS, tried // 2):
         if tried >= _MIN_SCANS:
-            evidence = (
-                f"In {without} of {tried} scans no velocity of the sensor fits 40 % of the Doppler values."
-            )
+            evidence = f"In {without} of {tried} scans no velocity fits 40 % of the Doppler values."
             yield Finding("doppler_without_velocity", "warning", evidence)
         return
     static = np.concatenate([velocity.static for velocity in velocities if velocity.found])
@@ -95,10 +93,8 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
     yaw = float(np.median(yaws))
     spread = 1.4826 * float(np.median(np.abs(yaws - yaw))) * np.sqrt(np.pi / 2 / len(yaws))
     if abs(yaw) > max(_MIN_YAW_RAD, _MIN_SIGNIFICANCE * spread):
-        evidence = (
-            f"The poses move {np.degrees(yaw):+.1f} degrees to the left of the Doppler velocity, in the median of "
-            f"{len(yaws)} scans."
-        )
+        degrees, over = np.degrees(yaw), f"the median of {len(yaws)} scans"
+        evidence = f"The poses move {degrees:+.1f} degrees to the left of the Doppler velocity, {over}."
         yield Finding("sensor_turned", "warning", evidence)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,9 +48,8 @@ def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
         times_s, doppler_mps = ascending_times_s(part), None
         if part.doppler_mps is not None and times_s is not None:
             doppler_mps = [speeds[::every] for speeds in part.doppler_mps]
-        refined = refine_poses(
-            points, part.poses, doppler_mps=doppler_mps, times_s=times_s, config=config, progress=False
-        )
+        options: dict[str, Any] = {"doppler_mps": doppler_mps, "times_s": times_s, "config": config}
+        refined = refine_poses(points, part.poses, **options, progress=False)
         if refined.improved:
             report, range_m = refined.report, median_range_m(points)
             moved_m = np.hypot(report["moved_m"], range_m * report["moved_rad"])

@@ -65,18 +65,16 @@ def misread_radars(recording: Scans) -> Iterator[tuple[Label, Finding]]:
         own = pairs[(rig.of_scan[pairs] == k).any(axis=1)]
         if len(own) == 0:
             continue
-        changed = np.where(
-            (rig.of_scan == k)[:, None, None, None], poses[:, None] @ turns, poses[:, None]
-        ).swapaxes(0, 1)
+        own_scans = (rig.of_scan == k)[:, None, None, None]
+        changed = np.where(own_scans, poses[:, None] @ turns, poses[:, None]).swapaxes(0, 1)
         T_j_i = np.stack([np.linalg.inv(each[own[:, 1]]) @ each[own[:, 0]] for each in changed])
         scores = agreement.scores(own, T_j_i)
         comparison = Comparison.of(scores[0], scores[1:])
         by_doppler = _log_ratios(recording.select(np.flatnonzero(rig.of_scan == k)), turns[:, :3, :3])
         evidence_of = comparison.significance**2 / 2 + by_doppler
         both = (comparison.significance > _SURE) & (by_doppler > 1) & (evidence_of > _LOG_RATIO)
-        alone = (
-            (comparison.significance > _SURE_ALONE) & (comparison.gains > _GAIN) & (by_doppler > -_LOG_RATIO)
-        )
+        sure = comparison.significance > _SURE_ALONE
+        alone = sure & (comparison.gains > _GAIN) & (by_doppler > -_LOG_RATIO)
         if not (both | alone).any():
             continue
         best = int(np.argmax(np.where(both | alone, comparison.significance + by_doppler, -np.inf)))

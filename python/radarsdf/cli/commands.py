@@ -55,7 +55,6 @@ radarsdf COMMAND --help lists the options of a command; radarsdf --version print
 
 
 def steps() -> str:
-    """Format the help of ``radarsdf tiles``."""
     return f"""\
 Usage: radarsdf tiles [STEP] [OPTIONS]...
 

@@ -13,7 +13,6 @@ class UsageError(Exception):
 
 
 def refuse_if(wrong: object, message: str) -> None:
-    """Raise a :class:`UsageError` with this message if `wrong`."""
     if wrong:
         raise UsageError(message)
 

@@ -38,11 +38,8 @@ class Checkpoint:
         self, path: str | PathLike[str], rays: Rays, scale: IntensityScale | None, config: FitConfig
     ) -> None:
         self._path = path_of(path, "checkpoint")
-        identity = {
-            "version": _core.__version__,
-            "scans": _digest(rays, scale),
-            "config": settings_of_results(config),
-        }
+        identity: dict[str, Any] = {"version": _core.__version__, "scans": _digest(rays, scale)}
+        identity["config"] = settings_of_results(config)
         self._identity: dict[str, Any] = json.loads(json.dumps(identity))
         self._next_s = time.monotonic() + _EVERY_S
         if self._path.exists():

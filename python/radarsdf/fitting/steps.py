@@ -222,25 +222,20 @@ def _contents(
 
 
 def _report(
-    given: FitInput,
-    learnt: Rays,
-    surface: SurfaceReturns,
-    field: Field,
-    schedule: Schedule,
-    config: FitConfig,
+    given: FitInput, rays: Rays, surface: SurfaceReturns, field: Field, schedule: Schedule, config: FitConfig
 ) -> dict[str, Any]:
     cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
-    sizes = {"returns": len(learnt), "cells": cells, "rows": rows}
+    sizes = {"returns": len(rays), "cells": cells, "rows": rows}
     skipped: list[tuple[str, float | None]] = []
     if given.why_none_moving is not None:
         skipped.append((f"leaving out what moves: {given.why_none_moving}", None))
     skipped += skipped_parts(config, schedule, with_intensity=with_intensity, **sizes)
-    outliers = 0 if learnt.intensities is None else len(learnt) - int(learnt.with_intensity.sum())
+    outliers = 0 if rays.intensities is None else len(rays) - int(rays.with_intensity.sum())
     return {
         "scans": len(given.rays.up_of_scan),
         "returns": given.rays.num_given + given.moving,
         "returns_used": surface.count,
-        "ghosts": len(learnt) - surface.count,
+        "ghosts": len(rays) - surface.count,
         "moving": given.moving,
         "intensity_outliers": outliers,
         "noise": dataclasses.asdict(surface.noise.mean),

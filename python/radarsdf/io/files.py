@@ -71,7 +71,6 @@ def check_outputs(
 
 
 def write_whole(path: str | PathLike[str], data: bytes) -> None:
-    """Write a file atomically; see :func:`whole_file`."""
     with whole_file(path) as file:
         file.write(data)
 

@@ -142,11 +142,8 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     single = {"poses": scans.poses, "times": scans.times_s, "lidar_points": scans.ground_truth}
     if (rig := scans.rig) is not None:
         labels = [str(label) for label in rig.labels]
-        single |= {
-            "sensor": rig.of_scan,
-            "sensor_labels": np.array(labels),
-            "T_body_sensor": rig.T_body_sensor,
-        }
+        single |= {"sensor": rig.of_scan, "sensor_labels": np.array(labels)}
+        single["T_body_sensor"] = rig.T_body_sensor
     if scans.imu is not None:
         single |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
     arrays |= {name: array for name, array in single.items() if array is not None}

@@ -61,7 +61,6 @@ class Trajectory:
     held: bool = False  # each pose holds until the next one
 
     def span(self) -> str:
-        """First and last time, for messages."""
         return f"{self.times_s[0]} to {self.times_s[-1]} s"
 
     @cached_property
@@ -113,7 +112,6 @@ class TransformChain:
         return pose
 
     def span(self) -> str:
-        """First and last time of the moving links, for messages."""
         return ", ".join(link.span() for link in self.links if not isinstance(link, np.ndarray))
 
 

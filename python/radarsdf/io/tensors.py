@@ -55,7 +55,6 @@ class TensorFile:
         return found
 
     def check_metadata(self) -> None:
-        """Raise a ValueError if the metadata or the names of the arrays differ from those written."""
         _ = self.checksums
 
     def array(self, name: str) -> Any:
@@ -69,6 +68,5 @@ class TensorFile:
 
 @contextmanager
 def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[TensorFile]:
-    """Open a safetensors file with arrays of this `framework`."""
     with safe_open(path, framework=framework) as file:
         yield TensorFile(file)

@@ -78,7 +78,6 @@ class LoggedScan:
 
     @property
     def arrays(self) -> dict[str, Array]:
-        """Existing arrays by name."""
         return {name: array for name in _KINDS if (array := getattr(self, name)) is not None}
 
     @property
@@ -97,7 +96,6 @@ class LoggedScan:
 
 
 def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
-    """Return the radars of the scans, if there are several."""
     known = [scan.radar for scan in scans if scan.radar is not None]
     return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
@@ -176,19 +174,16 @@ class ScanLog:
         self.num_bytes += scan.num_bytes - (0 if before is None else before.num_bytes)
 
     def exchanged(
-        self,
-        come: Mapping[ScanId, LoggedScan | _OnDisk],
-        gone: Iterable[ScanId],
-        sealed: Sequence[ScanId] = (),
+        self, new: Mapping[ScanId, LoggedScan | _OnDisk], old: Iterable[ScanId], sealed: Sequence[ScanId] = ()
     ) -> ScanLog:
-        """Return a log without the scans `gone`, and with those of `come`. Ids in both keep their place."""
+        """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
         log = copy(self)
         log._scans = self._scans.copy()
         if sealed:
             log.sealed = self.sealed.union(sealed)
-        for scan_id in set(gone).union(sealed) - come.keys():
+        for scan_id in set(old).union(sealed) - new.keys():
             log.num_bytes -= log._scans.pop(scan_id).num_bytes
-        for scan_id, scan in come.items():
+        for scan_id, scan in new.items():
             log._written += isinstance(scan, _OnDisk)
             log.put(scan_id, scan)
         return log
@@ -313,7 +308,6 @@ class Described(BaseModel):
 def save_state(
     path: str | PathLike[str], described: Described, scans: Iterable[LoggedScan], sums: GrowingSums
 ) -> None:
-    """Write a state atomically."""
     arrays = arrays_of_sums(sums, sums.block_keys())
     for i, scan in enumerate(scans):
         arrays |= {f"{name} {i}": array for name, array in scan.arrays.items()}

@@ -102,9 +102,8 @@ class BodyVelocities(SensorVelocities):
         found = super().select(rows)
         assert isinstance(found, BodyVelocities)
         steps = slice(rows.start, rows.stop - 1) if isinstance(rows, slice) else slice(0)
-        return dataclasses.replace(
-            found, of_radars_mps=self.of_radars_mps[:, steps], variances=self.variances[:, steps]
-        )
+        of_radars_mps, variances = self.of_radars_mps[:, steps], self.variances[:, steps]
+        return dataclasses.replace(found, of_radars_mps=of_radars_mps, variances=variances)
 
     def learnt(self, turn_rates: Sequence[MotionRate | None]) -> BodyVelocities:
         """Remove the mean difference of each radar from the others, given turn rates (F - 1), rad/s; None: unknown."""

@@ -160,15 +160,15 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     points, of_scan = [measured.points[i] for i in kept], rig.of_scan[kept]
     returns = SensorReturns.of(points, limits.min_range_m, limits.max_range_m, Rig(labels, of_scan, None))
     velocities = measured.mean_mps[kept], measured.whitening[kept]
-    radars = RadarsOfBody(of_scan, times_s[kept] - begin_s, returns, *velocities)
+    cell_m = plane_cell_m(points, config.leaf_size_m)
+    radars = RadarsOfBody(of_scan, times_s[kept] - begin_s, returns, *velocities, cell_m, reference)
     body = BodyPath.of(at_s - begin_s, path, end_s - begin_s, interval_s, mountings)
     steps = None
     if given:
         rows = (at_s >= begin_s) & (at_s <= end_s)
         motion = Motion.of(path[rows], *unsteadiness(path[rows], at_s[rows]), at_s[rows])
         steps = motion, at_s[rows] - begin_s
-    cell_m = plane_cell_m(points, config.leaf_size_m)
-    body, covariance = estimate_mountings(body, radars, reference, steps, cell_m, config)
+    body, covariance = estimate_mountings(body, radars, steps, config)
     each = zip(mountings, body.mountings, covariance, body.late_s, strict=True)
     found = {label: Mounting.of(*own) for label, own in zip(labels, each, strict=True)}
     own = measured.velocities.get(labels[reference])

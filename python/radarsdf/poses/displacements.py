@@ -34,7 +34,6 @@ class OtherMotion:
     confirmed: bool = True  # by the other source. Else this source observes neither motion nor its absence
 
     def words(self, source: str) -> str:
-        """Describe in words, without a full stop."""
         scans = f"from scan {self.first} to {self.last}"
         if self.ratio is None:
             return f"{scans}, it shows no motion, which {source} do not confirm"

@@ -99,12 +99,9 @@ class SensorVelocities:
         return cls(mean, covariance, change, static, found, climb_assumed=weak, of_scans=each)
 
     def select(self, rows: slice | Ints) -> SensorVelocities:
-        """Select scans."""
-        mean_mps, covariance = self.mean_mps[rows], self.covariance[rows]
         static = [self.static[i] for i in np.arange(len(self.static))[rows]]
-        return dataclasses.replace(
-            self, mean_mps=mean_mps, covariance=covariance, static=static, found=self.found[rows]
-        )
+        columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
+        return dataclasses.replace(self, static=static, of_scans=(), **columns)
 
     @property
     def usual_mps(self) -> float:
@@ -210,7 +207,6 @@ class DopplerMotion(KnownMotion):
         return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
     def at(self, poses: Floats) -> DopplerMotion:
-        """Update the translations for the rotations of `poses`."""
         return self.turned(steps(poses)[:, :3, :3])
 
     def turned(self, rotations: Floats) -> DopplerMotion:

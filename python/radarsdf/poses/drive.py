@@ -152,12 +152,8 @@ def track_drive(
             turns = MotionPrior(usual, usual, True)
         steady_moves = moves.learnt(move_rates, durations_s, with_errors=True)
         steady_turns = turns.learnt(turn_rates, durations_s, with_errors=True)
-        drive = dataclasses.replace(
-            drive,
-            turns=turns.learnt(turn_rates, durations_s),
-            moves=moves.learnt(move_rates, durations_s),
-            steady=(steady_moves, steady_turns),
-        )
+        turns, moves = turns.learnt(turn_rates, durations_s), moves.learnt(move_rates, durations_s)
+        drive = dataclasses.replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
         if i == 0 and isinstance(drive.velocities, BodyVelocities):
             drive = dataclasses.replace(drive, velocities=drive.velocities.learnt(turn_rates))
         if i == 0 and gyroscope is not None:

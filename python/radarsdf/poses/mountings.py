@@ -59,6 +59,8 @@ class RadarsOfBody:
     returns: SensorReturns
     mean_mps: Floats  # (F, 3) in the sensor frame
     whitening: Floats  # (F, 3, 3) of velocities; 0: unknown
+    cell_m: float  # edge of the cell of a plane
+    reference: int  # radar whose mounting is kept
 
 
 @dataclass(frozen=True)
@@ -87,12 +89,10 @@ class BodyPath:
     shares: Floats  # (K, 3)
 
     @classmethod
-    def of(
-        cls, times_s: Floats, poses: Floats, end_s: float, interval_s: float, mountings: Floats
-    ) -> BodyPath:
-        """Fit a spline from 0 to `end_s`, with knots every `interval_s`, to poses (F, 4, 4) at times (F,)."""
-        count = int(np.ceil(end_s / interval_s)) + 3
-        knots_s = interval_s * np.linspace(-3, count, count + 4)
+    def of(cls, times_s: Floats, poses: Floats, end_s: float, step_s: float, mountings: Floats) -> BodyPath:
+        """Fit a spline from 0 to `end_s`, with knots every `step_s`, to poses (F, 4, 4) at times (F,)."""
+        count = int(np.ceil(end_s / step_s)) + 3
+        knots_s = step_s * np.linspace(-3, count, count + 4)
         first = RotationSpline(times_s, Rotation.from_matrix(poses[:, :3, :3]))
         within = (times_s >= 0) & (times_s <= end_s)
         weights, positions = BSpline(knots_s, np.eye(count), 3)(times_s[within]), poses[within, :3, 3]
@@ -111,10 +111,9 @@ class BodyPath:
         turns = weights @ self.turns
         R = rotation(turns[0]) @ self.first(times_s).as_matrix()
         omega, alpha = (self.first(times_s, i) + np.einsum("fji,fj->fi", R, turns[i]) for i in (1, 2))
-        change = np.stack(
-            [v, (R @ omega[..., None])[..., 0], acceleration, (R @ alpha[..., None])[..., 0]], axis=1
-        )
-        return _Motion(weights[0], weights[1], R, p, v, omega, change.reshape(-1, 12))
+        turning, accelerating = np.einsum("fij,kfj->kfi", R, [omega, alpha])
+        change = np.concatenate([v, turning, acceleration, accelerating], axis=1)
+        return _Motion(weights[0], weights[1], R, p, v, omega, change)
 
     def moved(self, step: Floats) -> BodyPath:
         count = len(self.positions)
@@ -165,9 +164,8 @@ def _sensor_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Floats, 
     own[:, :3, :3] = own[:, 3:6, 3:6] = at.R
     own[:, 6:, :3], own[:, 6:, 3:6] = from_body @ skew(at.omega), from_body @ skew(in_body)
     own[:, 6:, 7:] = speeds[:, None, None] * np.eye(3)
-    of_poses, of_velocities = (
-        path.columns(at, by_motion[:, rows], own[:, rows], radars.of_scan) for rows in (slice(6), slice(6, 9))
-    )
+    of_poses = path.columns(at, by_motion[:, :6], own[:, :6], radars.of_scan)
+    of_velocities = path.columns(at, by_motion[:, 6:], own[:, 6:], radars.of_scan)
     return poses, velocities + speeds[:, None] * path.shares[radars.of_scan], of_poses, of_velocities
 
 
@@ -205,21 +203,11 @@ def _plane_equations(
     np.add.at(counts, (plane, radar), 1)
     few = (counts[plane, radar] < _FEWEST) & (np.count_nonzero(counts, axis=1)[plane] > 1)
     planes[on[few]] = -1
-    common = CommonPlanes(
-        rays.points,
-        rays.directions,
-        rays.ranges_m,
-        rays.scans,
-        planes,
-        poses[:, :3, 3] - rays.origin,
-        rays.up_of_scan,
-        surfels.centres,
-        unbiased_normals(surfels, num_threads),
-        cell_m,
-        rig_noise(surfels, rays, config.returns, num_threads).of_scans(rays),
-        len(poses),
-        num_threads,
-    )
+    noise = rig_noise(surfels, rays, config.returns, num_threads).of_scans(rays)
+    of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, planes
+    of_scans = poses[:, :3, 3] - rays.origin, rays.up_of_scan
+    of_planes = surfels.centres, unbiased_normals(surfels, num_threads)
+    common = CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, noise, len(poses), num_threads)
     diagonal, gradient, coupling, scans, first = common.equations
     shape = 3 * (len(first) - 1), 6 * len(poses)
     C = sparse.bsr_matrix((coupling.reshape(-1, 3, 6), scans, first), shape)
@@ -227,17 +215,12 @@ def _plane_equations(
 
 
 def estimate_mountings(
-    path: BodyPath,
-    radars: RadarsOfBody,
-    reference: int,
-    steps: tuple[Motion, Floats] | None,
-    cell_m: float,
-    config: FitConfig,
+    path: BodyPath, radars: RadarsOfBody, steps: tuple[Motion, Floats] | None, config: FitConfig
 ) -> tuple[BodyPath, Floats]:
     """Return the estimates and covariances (K, 7, 7) of lever arm, rotation and time offset. `steps`: given ones, at times (F,)."""
     given, num_path, K = path.mountings, _PATH * len(path.positions), len(path.mountings)
     information, num_threads = np.tile(1 / PRIOR**2, (K, 1)), resolve_num_threads(config.num_threads)
-    information[reference, :7] = _FIXED
+    information[radars.reference, :7] = _FIXED
     # Includes the noise of the first trajectory: an overestimate.
     spread = np.sqrt((_smooth_rows(path)[1] ** 2).mean(axis=0)) + _LEAST_CHANGE
     for cells in _CELLS:
@@ -256,7 +239,7 @@ def estimate_mountings(
         for J, residual in rows if steps is None else [*rows, _step_rows(path, *steps)]:
             H, g = H + J.T @ J, g + J.T @ residual.ravel()
         if cells:
-            of_planes, gradient = _plane_equations(poses, radars, cells * cell_m, config, num_threads)
+            of_planes, gradient = _plane_equations(poses, radars, cells * radars.cell_m, config, num_threads)
             H, g = H + of_poses.T @ of_planes @ of_poses, g + of_poses.T @ gradient
         solver = splu(H.tocsc())
         path = path.moved(-solver.solve(g))

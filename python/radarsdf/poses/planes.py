@@ -114,11 +114,9 @@ class SensorReturns:
         return len(self.scans)
 
     def select(self, part: Bools) -> SensorReturns:
-        """Select returns by a mask (N,)."""
         return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part], self.rig)
 
     def every(self, step: int) -> SensorReturns:
-        """Return every `step`-th return."""
         return self.select(np.arange(len(self)) % step == 0)
 
     def posed(self, poses: Floats) -> Rays:
@@ -176,21 +174,12 @@ def common_planes(
         if noise is None:
             noises.append(sensor_noise(surfels, part, config, num_threads))
     known = SensorNoise.median(noises) if noise is None else noise
-    common = CommonPlanes(
-        rays.points,
-        rays.directions,
-        rays.ranges_m,
-        rays.scans,
-        planes,
-        poses[:, :3, 3] - rays.origin,
-        rays.up_of_scan,
-        np.concatenate(centres),
-        np.ascontiguousarray(np.concatenate(normals)),
-        grid.cell_m,
-        known.of_scans(rays),
-        min(grid.window, _TOGETHER),
-        num_threads,
-    )
+    of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, planes
+    of_scans = poses[:, :3, 3] - rays.origin, rays.up_of_scan
+    of_planes = np.concatenate(centres), np.ascontiguousarray(np.concatenate(normals))
+    extent_m, together = grid.cell_m, min(grid.window, _TOGETHER)
+    noise_of_scan = known.of_scans(rays)
+    common = CommonPlanes(*of_rays, *of_scans, *of_planes, extent_m, noise_of_scan, together, num_threads)
     return common, known
 
 

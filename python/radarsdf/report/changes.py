@@ -43,15 +43,6 @@ def write_changes_report(
         size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
         numbers = fixed(region.area_m2, 2), fixed(region.probability, 2)
         rows.append((number, region.words, centre_of(region), size, *numbers))
-    return write_page(
-        path,
-        "changes.html",
-        names=names,
-        report=changes.report,
-        surface=surface,
-        key=MEANING,
-        regions=regions,
-        rows=rows,
-        kinds=[NAMES[kind] for kind in CHANGED],
-        max_listed=_MAX_LISTED,
-    )
+    values = {"report": changes.report, "regions": regions, "rows": rows, "max_listed": _MAX_LISTED}
+    kinds = [NAMES[kind] for kind in CHANGED]
+    return write_page(path, "changes.html", names=names, surface=surface, key=MEANING, kinds=kinds, **values)

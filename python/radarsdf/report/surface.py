@@ -102,14 +102,9 @@ def scene(vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None 
         data = glb(np.round(vertices * _STEPS_PER_M) / _STEPS_PER_M, faces, colors)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
         if sensors is not None:
-            server.scene.add_point_cloud(
-                "/sensor",
-                sensors.astype(np.float32),
-                _SENSOR_COLOR,
-                point_size=0.008 * float(np.linalg.norm(pose.position - pose.look_at)),
-                point_shape="circle",
-                precision="float32",
-            )
+            size = 0.008 * float(np.linalg.norm(pose.position - pose.look_at))
+            style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
+            server.scene.add_point_cloud("/sensor", sensors.astype(np.float32), _SENSOR_COLOR, **style)
         set_initial_camera(server, pose)
         document: str = server.get_scene_serializer().as_html()
     finally:

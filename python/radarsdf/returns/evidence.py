@@ -131,9 +131,7 @@ class VisibilityCounts:
         return np.append(self.scans, np.uint32(0))[rows]  # the last entry serves row -1, no block
 
 
-def evidence_sums(
-    returns: ReturnsOfCells, leaf_keys: Keys, num_threads: int = 0
-) -> tuple[Floats32, Counts32]:
+def evidence_sums(returns: ReturnsOfCells, leaf_keys: Keys, num_threads: int) -> tuple[Floats32, Counts32]:
     """Compute `information` and `hits` of :class:`Evidence`, (C,) each, for leaf cells with ascending keys (C,)."""
     blocks = CellBlocks(returns.keys)
     columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)

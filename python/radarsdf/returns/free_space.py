@@ -62,7 +62,6 @@ class FreeSpace:
         return cls(np.zeros(0, np.uint64), np.zeros((0, _PLANES, _WORDS), np.uint64))
 
     def check(self) -> None:
-        """Raise a ValueError if the arrays read from a file are inconsistent."""
         shaped = self.keys.ndim == 1 and self.planes.shape == (len(self.keys), _PLANES, _WORDS)
         fits = shaped and (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
         check(fits, "the free-space crossings are not planes of 512 cells for ascending keys")

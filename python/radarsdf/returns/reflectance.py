@@ -75,7 +75,6 @@ class Reflectance:
         return CellMeans(_in_metres(_KINDS, self.leaf_size_m), _TILINGS, self.mean_keys, means)
 
     def check(self) -> None:
-        """Raise a ValueError if keys are not ascending, or shapes do not match."""
         shapes = self.coefficients.shape, self.table.shape, self.normals.shape
         fits = shapes == ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3))
         check(fits, "the reflectance has arrays of wrong shapes")

@@ -59,7 +59,6 @@ class TileBlend(Map):
 
     @cached_property
     def done(self) -> set[Tile]:
-        """Indices of the tiles that are done."""
         return {tile.tile for tile in self.tiles}
 
     @cached_property

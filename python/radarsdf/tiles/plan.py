@@ -204,12 +204,10 @@ class Plan:
 
 
 def folder_of(folder: Path, tile: Tile) -> Path:
-    """Folder of the files of a tile."""
     return folder / TILES / f"{tile[0]}_{tile[1]}"
 
 
 def map_path(folder: Path, tile: TilePlan) -> Path:
-    """File of the map of a tile."""
     return folder_of(folder, tile.tile) / "map.safetensors"
 
 

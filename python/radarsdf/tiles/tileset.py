@@ -62,12 +62,8 @@ def write_tileset(city: TileBlend, path: Path, meshes: Iterable[tuple[Floats, In
         count += len(vertices), len(faces)
     check(children, "no tile has a triangle, so there is nothing to write")
     error_m = float(np.ptp(corners, axis=0).max()) * _ERROR_OF_EDGE
-    root = {
-        "boundingVolume": _box(np.array(corners)),
-        "geometricError": error_m,
-        "refine": "ADD",
-        "children": children,
-    }
+    root = {"boundingVolume": _box(np.array(corners)), "geometricError": error_m}
+    root |= {"refine": "ADD", "children": children}
     # The JSON is last, so that all files it names exist.
     described = {"asset": {"version": "1.1"}, "geometricError": error_m, "root": root}
     write_whole(path, json.dumps(described, allow_nan=False).encode())

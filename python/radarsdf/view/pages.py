@@ -30,7 +30,6 @@ MEANING = {name + _NOTES.get(name, ""): color for name, color in _NAMED_COLORS}
 
 
 def centre_of(region: Region) -> str:
-    """Format the centre of a change, world frame."""
     return "({:.1f}, {:.1f}, {:.1f}) m".format(*region.box.mean(axis=0))
 
 

@@ -73,13 +73,11 @@ def start_server(host: str, port: int) -> Any:
 
 
 def stop_server(server: Any) -> None:
-    """Close all connections and end the threads of a server."""
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints
         server.stop()
 
 
 def set_initial_camera(server: Any, pose: CameraPose) -> None:
-    """Set the initial camera of new pages."""
     camera = server.initial_camera
     camera.fov = FOV_RAD
     camera.position, camera.look_at = map(tuple, pose)
@@ -118,12 +116,10 @@ class Page:
         self._server: Any = start_server(self.host, self.port)
 
     def wait(self) -> None:
-        """Wait until Ctrl-C."""
         while True:
             time.sleep(WAIT_STEP_S)
 
     def stop(self) -> None:
-        """Close the page and end all threads."""
         stop_server(self._server)
 
     def __enter__(self) -> Self:

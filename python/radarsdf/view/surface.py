@@ -45,15 +45,11 @@ class ShownSurface:
         threshold = Threshold.of_mesh(mesh.metadata)
         mesh, spacing_m = thinned(mesh, max_vertices, voxel_size)
         check(len(mesh.vertices), "the map has no surface here")
-        return cls(
-            np.asarray(mesh.vertices, np.float64),
-            np.asarray(mesh.faces, np.int32),
-            np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float32),
-            np.asarray(mesh.vertex_attributes["confidence"], np.float32),
-            lightness_of(mesh.vertex_normals),
-            threshold,
-            spacing_m,
-        )
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+        names = ("uncertainty_m", "confidence")
+        uncertainty_m, confidence = (np.asarray(mesh.vertex_attributes[name], np.float32) for name in names)
+        lightness = lightness_of(mesh.vertex_normals)
+        return cls(vertices, faces, uncertainty_m, confidence, lightness, threshold, spacing_m)
 
     def kept(self, max_uncertainty_m: float, min_confidence: float) -> Bools:
         """Return a mask (V,) of vertices within the limits."""
