@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +23,8 @@ MISSING_POSES = (
     "poses are missing: T_world_sensor (4, 4) of each scan; "
     "radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
 )
+
+AnyPath: TypeAlias = str | os.PathLike[str]
 
 _Kind = TypeVar("_Kind")
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
-from radarsdf.checks import path_of
+from radarsdf.checks import AnyPath, path_of
 from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.threshold import across_triangles
 
@@ -151,7 +150,7 @@ class Changes:
         mesh.visual.vertex_colors = colors_of(mesh.vertex_attributes["kind"])
         return mesh
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the mesh of :meth:`mesh` by :func:`radarsdf.io.write_mesh`, with its formats and errors."""
         from radarsdf.io.meshes import write_mesh  # noqa: PLC0415 - as above
 

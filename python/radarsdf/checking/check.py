@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Bools, Ints
-from radarsdf.checking import drift, frames, noise, piecewise, trajectory
+from radarsdf.checking import drift, frames, noise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.mounting import check_mountings, misread_radars
@@ -131,7 +131,7 @@ def _sorted(found: list[Finding]) -> list[Finding]:
 
 def _drift(recording: Scans, numbers: Ints, config: FitConfig, found: list[Finding]) -> list[Finding]:
     """Exchanged scans, which refined poses would hide, or drift of the poses or what explains it better."""
-    faults = list(piecewise.check_order(recording, numbers)) or list(drift.check_drift(recording, config))
+    faults = list(drift.check_order(recording, numbers)) or list(drift.check_drift(recording, config))
     unknown = any(finding.name == "motion_undecided" for finding in found)
     return [
         Finding("undecided", "warning", fault.evidence) if unknown and fault.name == "poses_drift" else fault
@@ -174,7 +174,8 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         recording = _without(recording, left_out)
     empty = np.array([mask.all() for mask in left_out])
     if empty.any():
-        evidence = f"{empty.sum()} of {len(empty)} scans have no returns, the first is {np.argmax(empty)}."
+        count, first = f"{empty.sum()} of {len(empty)}", np.argmax(empty)
+        evidence = f"{count} scans have no returns, the first is scan {first}."
         found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
     if not empty.all():
         found += trajectory.check_rigid(recording)

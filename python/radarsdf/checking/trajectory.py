@@ -75,7 +75,8 @@ def check_times(recording: Scans) -> Iterator[Finding]:
     if times is None or len(times) < 2 or ascending_times_s(recording) is not None:
         return
     wrong = int((~(np.diff(times) > 0)).sum())
-    evidence = f"{wrong} of {len(times) - 1} times do not ascend or are not finite: none is used."
+    late = f"{wrong} of {len(times) - 1} times are not later than the one before"
+    evidence = f"{late}, or not finite: none is used."
     yield Finding("times", "warning", evidence)
 
 
@@ -92,7 +93,8 @@ def check_duplicates(recording: Scans, numbers: Ints) -> Iterator[Finding]:
             repeated.append((same, i))
     if repeated:
         first, copy = numbers[list(repeated[0])]
-        evidence = f"{len(repeated)} of {len(recording)} scans are copies, such as {copy} of {first}."
+        count = f"{len(repeated)} of {len(recording)}"
+        evidence = f"{count} scans are copies, such as scan {copy} of scan {first}."
         yield Finding("duplicate_scans", "warning", evidence)
     same_pose = (recording.poses[1:] == recording.poses[:-1]).all(axis=(1, 2))
     same_pose[[later - 1 for earlier, later in repeated if later == earlier + 1]] = False

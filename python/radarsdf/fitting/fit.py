@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from os import PathLike
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import instance, pose_matrices
+from radarsdf.checks import AnyPath, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.map.radar_map import RadarMap
@@ -27,7 +26,7 @@ def fit(
     doppler_mps: Sequence[ArrayLike] | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
-    checkpoint: str | PathLike[str] | None = None,
+    checkpoint: AnyPath | None = None,
     origin: ArrayLike | None = None,
     intensity_range: tuple[float, float] | None = None,
 ) -> RadarMap:

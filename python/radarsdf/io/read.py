@@ -11,7 +11,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import check, check_pose, path_of, positions, positive
+from radarsdf.checks import AnyPath, check, check_pose, path_of, positions, positive
 from radarsdf.imu import checked_rotation
 from radarsdf.io import datasets, recordings
 from radarsdf.io import poses as pose_files
@@ -24,8 +24,8 @@ from radarsdf.scans import Notes, Scans
 
 
 def read(
-    path: str | PathLike[str] | Sequence[str | PathLike[str]],
-    poses: str | PathLike[str] | ArrayLike | pose_files.StampedPoses | None = None,
+    path: AnyPath | Sequence[AnyPath],
+    poses: AnyPath | ArrayLike | pose_files.StampedPoses | None = None,
     *,
     extrinsic: ArrayLike | None = None,
     topic: str | Sequence[str] | None = None,
@@ -37,7 +37,7 @@ def read(
     fields: Mapping[str, Any] | None = None,
     columns: int | Sequence[str] | None = None,
     max_gap_s: float = pose_files.MAX_GAP_S,
-    ground_truth: str | PathLike[str] | ArrayLike | None = None,
+    ground_truth: AnyPath | ArrayLike | None = None,
 ) -> Scans:
     """Read scans with poses from a file, a folder or bags.
 

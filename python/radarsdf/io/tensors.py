@@ -7,14 +7,13 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from os import PathLike
 from typing import Any
 
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from radarsdf.checks import check
+from radarsdf.checks import AnyPath, check
 
 _CHECKSUMS = "crc32"  # key of the metadata: CRC-32 of each tensor by name, and of the other metadata as ""
 
@@ -67,6 +66,6 @@ class TensorFile:
 
 
 @contextmanager
-def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[TensorFile]:
+def open_tensors(path: AnyPath, framework: str = "pt") -> Iterator[TensorFile]:
     with safe_open(path, framework=framework) as file:
         yield TensorFile(file)

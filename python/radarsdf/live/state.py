@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from radarsdf._core import QUANTA, GrowingSums, SumsChange
 from radarsdf.arrays import Array, Floats, Keys
-from radarsdf.checks import check
+from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
 from radarsdf.interrupts import at_once
@@ -172,7 +171,7 @@ class GrowingState:
         self._changed.clear()
         return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
         ids: list[Any] = [*self.log.ids, *self.log.sealed]
         mountings: list[Any] | None = None

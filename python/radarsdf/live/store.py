@@ -7,7 +7,6 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from radarsdf._core import GrowingSums
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Keys
-from radarsdf.checks import MAX_POSITION_M, check, check_pose, check_values_of_scan, positions
+from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, check_values_of_scan, positions
 from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.regions import REGION_BITS
@@ -305,9 +304,7 @@ class Described(BaseModel):
         return None if self.mountings is None else checked_mountings(dict(self.mountings))
 
 
-def save_state(
-    path: str | PathLike[str], described: Described, scans: Iterable[LoggedScan], sums: GrowingSums
-) -> None:
+def save_state(path: AnyPath, described: Described, scans: Iterable[LoggedScan], sums: GrowingSums) -> None:
     arrays = arrays_of_sums(sums, sums.block_keys())
     for i, scan in enumerate(scans):
         arrays |= {f"{name} {i}": array for name, array in scan.arrays.items()}
@@ -315,7 +312,7 @@ def save_state(
     write_arrays(path, arrays)
 
 
-def load_state(path: str | PathLike[str]) -> tuple[Described, list[LoggedScan], tuple[Array, ...]]:
+def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array, ...]]:
     """Read a state written by :func:`save_state`, with the columns of its sums."""
     check_regular_file(path)
     with reading(path, "the state of a live map of this version, or it is damaged", KeyError, TypeError):

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import Self
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.poses.doppler import SensorVelocities
@@ -97,10 +98,9 @@ class BodyVelocities(SensorVelocities):
             levers=skew(np.stack([mountings[rows[0], :3, 3] for rows, _ in measured])),
         )
 
-    def select(self, rows: slice | Ints) -> SensorVelocities:
+    def select(self, rows: slice | Ints) -> Self:
         """Select consecutive scans; of others, velocities without those of steps."""
         found = super().select(rows)
-        assert isinstance(found, BodyVelocities)
         steps = slice(rows.start, rows.stop - 1) if isinstance(rows, slice) else slice(0)
         of_radars_mps, variances = self.of_radars_mps[:, steps], self.variances[:, steps]
         return dataclasses.replace(found, of_radars_mps=of_radars_mps, variances=variances)
@@ -112,7 +112,6 @@ class BodyVelocities(SensorVelocities):
             return self
         rates = np.stack([rate.mean for rate in turn_rates if rate is not None])
         mean_mps, _, levers = self.of_steps
-        assert levers is not None
         body_mps = mean_mps[rows] + np.einsum("fij,fj->fi", levers[rows], rates)
         off = self.of_radars_mps[:, rows] - body_mps + np.einsum("kij,fj->kfi", self.levers, rates)
         information = self._information[:, rows]
@@ -131,7 +130,7 @@ class BodyVelocities(SensorVelocities):
         return variances @ self._information, variances
 
     @cached_property
-    def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
+    def of_steps(self) -> tuple[Floats, Floats, Floats]:
         weights, _ = self._weights
         mean = np.einsum("kfij,kfj->fi", weights, self.of_radars_mps)
         return mean, mean, np.einsum("kfij,kjl->fil", weights, self.levers)
@@ -145,7 +144,6 @@ class BodyVelocities(SensorVelocities):
     def turn_given(self, turn: MotionRate, i: int, duration_s: float) -> MotionRate:
         """Return a turn (rad) in the step from scan `i`, given the differences of the velocities of the radars."""
         mean_mps, _, levers = self.of_steps
-        assert levers is not None
         if duration_s == 0 or not self.agree:
             return turn
         apart = (self.levers - levers[i]) / duration_s

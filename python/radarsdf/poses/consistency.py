@@ -162,10 +162,8 @@ def _relative_differences(
     """Return differences (F - 1,) of tracked steps from those by Doppler, relative to these; NaN where returns hardly observe them."""
     own = motion.steps[:, :3, 3]
     along = np.einsum("ki,ki->k", shown - own, own) / np.maximum((own**2).sum(axis=1), 1e-12)
-    before, left = (
-        np.einsum("ki,kij,kj->k", own, each, own)
-        for each in (prior.step_covariances(motion.durations_s), covariance)
-    )
+    before = np.einsum("ki,kij,kj->k", own, prior.step_covariances(motion.durations_s), own)
+    left = np.einsum("ki,kij,kj->k", own, covariance, own)
     seen = 1 - left / np.maximum(before, 1e-30)
     # Without the share of the prior.
     return np.where(seen > _LEAST_SEEN, along / np.maximum(seen, _LEAST_SEEN), np.nan)

@@ -82,9 +82,8 @@ def contradiction(
         if abs(share) <= max(needed, ERRORS / np.sqrt(information)) + _SAME_SPEED:
             continue
         if (excess := abs(share) - needed) > worst:
-            by_doppler, by_other = (
-                float((weights * np.einsum("ki,ki->k", moves, longer)).sum()) for moves in (doppler, shown)
-            )
+            by_doppler = float((weights * np.einsum("ki,ki->k", doppler, longer)).sum())
+            by_other = float((weights * np.einsum("ki,ki->k", shown, longer)).sum())
             ratio = by_other / by_doppler if abs(by_doppler) > 0.05 * abs(by_other) else None
             worst, found = excess, OtherMotion(int(scans[rows.start]), int(scans[rows.stop]), ratio)
     return found

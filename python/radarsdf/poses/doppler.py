@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
 from radarsdf.poses.motion import KnownMotion, spans_of, turned_halfway, usual_duration_s, way
@@ -98,7 +99,7 @@ class SensorVelocities:
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
         return cls(mean, covariance, change, static, found, climb_assumed=weak, of_scans=each)
 
-    def select(self, rows: slice | Ints) -> SensorVelocities:
+    def select(self, rows: slice | Ints) -> Self:
         static = [self.static[i] for i in np.arange(len(self.static))[rows]]
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
         return dataclasses.replace(self, static=static, of_scans=(), **columns)

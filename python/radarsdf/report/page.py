@@ -6,11 +6,11 @@ import base64
 import functools
 import math
 import time
-from os import PathLike
 from typing import Any
 
 import jinja2
 
+from radarsdf.checks import AnyPath
 from radarsdf.extras import require
 from radarsdf.io.files import write_whole
 from radarsdf.view.pages import centre_of
@@ -24,7 +24,7 @@ def require_extras() -> None:
     require("matplotlib", "viser", what="a report needs")
 
 
-def write_page(path: str | PathLike[str], template: str, **values: Any) -> int:
+def write_page(path: AnyPath, template: str, **values: Any) -> int:
     """Fill a template and write the page atomically. Returns the size of the file, bytes."""
     made = time.strftime("%Y-%m-%d %H:%M")
     data = _environment().get_template(template).render(made=made, **values).encode()

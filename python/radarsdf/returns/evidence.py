@@ -88,10 +88,9 @@ class ReturnsOfCells:
         parts = noise.weights(rays)
         ones: Floats32 = np.broadcast_to(np.float32(1), len(rays))
         ones = ones if parts is None else (parts / WEIGHT_UNIT).astype(np.float32)
-        weights, information = (
-            np.bincount(cells.cell_of_ray, values, len(cells.keys)).astype(np.float32)
-            for values in weights_of(ones, rays.ranges_m, noise)
-        )
+        of_rays = weights_of(ones, rays.ranges_m, noise)
+        sums = [np.bincount(cells.cell_of_ray, values, len(cells.keys)) for values in of_rays]
+        weights, information = (values.astype(np.float32) for values in sums)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m, len(cells.keys)) / cells.counts
         found = cls(cells.keys, weights, information, scans, cells.counts)

@@ -86,9 +86,8 @@ def _first_crossed_near_sample(
     follow(rows)
     blocks = surfels.keys[cell_of_ray] >> np.uint64(6)
     block = np.cumsum(np.diff(blocks, prepend=blocks[:1]) != 0)
-    counts, crossing = (
-        np.bincount(block[rows[of]], minlength=len(rays.keys)) for of in (slice(None), first[rows] >= 0)
-    )
+    counts = np.bincount(block[rows], minlength=len(rays.keys))
+    crossing = np.bincount(block[rows[first[rows] >= 0]], minlength=len(rays.keys))
     follow(np.flatnonzero(~sampled & ~((counts >= FEWEST_SAMPLED) & (crossing == 0))[block]))
     return first
 

@@ -133,10 +133,8 @@ def sensor_velocities(
 ) -> list[SensorVelocity]:
     """Estimate the velocity in each of K scans of a sensor. `others_mps`: further speeds to find the ambiguity interval."""
     interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None
-    choices = [
-        [sensor_velocity(x, v, interval_mps=folded) for x, v in zip(points, doppler_mps, strict=True)]
-        for folded in ((None, interval) if interval else (None,))
-    ]
+    pairs, folds = list(zip(points, doppler_mps, strict=True)), (None, interval) if interval else (None,)
+    choices = [[sensor_velocity(x, v, folded) for x, v in pairs] for folded in folds]
     agreeing = [sum(int(velocity.static.sum()) for velocity in found) for found in choices]
     # Aliasing lets more returns agree by chance, so it must explain clearly more of them.
     return choices[-1] if agreeing[-1] > 1.2 * agreeing[0] else choices[0]

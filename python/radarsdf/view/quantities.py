@@ -81,10 +81,8 @@ def legend(quantity: Quantity) -> str:
     scale = quantity.scale
     bar = f"height:0.8em;border-radius:0.2em;background:linear-gradient(to right,{scale.css})"
     ends = "display:flex;justify-content:space-between;font-variant-numeric:tabular-nums"
-    return _block(
-        f'<div>{quantity.label}</div><div style="{bar}"></div>'
-        f'<div style="{ends}"><span>{scale.low:.3g}</span><span>{scale.high:.3g}</span></div>'
-    )
+    limits = f"<span>{scale.low:.3g}</span><span>{scale.high:.3g}</span>"
+    return _block(f'<div>{quantity.label}</div><div style="{bar}"></div><div style="{ends}">{limits}</div>')
 
 
 def key(colors: Mapping[str, Color | Scale]) -> str:
@@ -98,10 +96,8 @@ def key(colors: Mapping[str, Color | Scale]) -> str:
         else:
             background = css_color(color)
         mark = f"flex:none;width:0.8em;height:0.8em;border-radius:0.2em;background:{background}"
-        rows.append(
-            '<div style="display:flex;align-items:center;gap:0.5em">'
-            f'<i style="{mark}"></i><span>{escape(name)}{limits}</span></div>'
-        )
+        words = f'<i style="{mark}"></i><span>{escape(name)}{limits}</span>'
+        rows.append(f'<div style="display:flex;align-items:center;gap:0.5em">{words}</div>')
     return _block("".join(rows))
 
 
