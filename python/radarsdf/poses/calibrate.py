@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -144,16 +144,8 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     if imu is not None and imu.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=mountings[reference, :3, :3].T @ imu.R_sensor_imu)
     measured = _measure(scans, rig, times_s)
-    notes = measured.notes
-    used = first = np.flatnonzero(rig.of_scan == reference)
-    try:
-        given, path = True, scans.poses[first]
-    except ValueError:
-        given = False
-        used, path, more = _odometry_of(scans, first, mountings[reference], imu, config)
-        notes += more
-    rising = np.append(True, np.diff(times_s[used]) > 0)
-    at_s, path = times_s[used][rising], path[rising]
+    first = np.flatnonzero(rig.of_scan == reference)
+    at_s, path, given, on_path = _body_path(scans, first, mountings[reference], imu, config)
     interval_s = float(np.median(np.diff(times_s[first])))
     begin_s, end_s = _turning_part(at_s, path, _MOST_KNOTS * interval_s)
     kept = np.flatnonzero((times_s >= begin_s) & (times_s <= end_s))
@@ -173,7 +165,7 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     found = {label: Mounting.of(*own) for label, own in zip(labels, each, strict=True)}
     own = measured.velocities.get(labels[reference])
     of_imu, on_imu = _imu_mounting(imu, own, times_s[first], mountings[reference])
-    return Calibration(found, of_imu, str(labels[reference]), [*notes, *on_imu])
+    return Calibration(found, of_imu, str(labels[reference]), [*measured.notes, *on_path, *on_imu])
 
 
 class _Measured(NamedTuple):
@@ -211,16 +203,23 @@ def _measure(scans: Scans, rig: Rig, times_s: Floats) -> _Measured:
     return _Measured(points, mean, np.linalg.cholesky(information).swapaxes(1, 2), velocities, notes)
 
 
-def _odometry_of(
+def _body_path(
     scans: Scans, rows: Ints, T_body_sensor: Floats, imu: Imu | None, config: FitConfig
-) -> tuple[Ints, Floats, list[str]]:
-    """Return the scans of the longest segment of one radar's odometry, their poses of the body, and notes."""
+) -> tuple[Floats, Floats, bool, list[str]]:
+    """Return ascending times and poses of the body at scans of one radar, whether they are given, else by odometry, and notes."""
     assert scans.times_s is not None
-    own, doppler_mps = [scans.points[i] for i in rows], chosen(scans.doppler_mps, rows)
-    times_s = scans.times_s[rows]
-    found = odometry(own, doppler_mps=doppler_mps, times_s=times_s, imu=imu, config=config, progress=False)
-    part = found.longest_segment()
-    return rows[part], found.poses[part] @ np.linalg.inv(T_body_sensor), found.report["notes"]
+    times_s, given, notes = scans.times_s[rows], True, list[str]()
+    try:
+        path = scans.poses[rows]
+    except ValueError:
+        own, doppler_mps = [scans.points[i] for i in rows], chosen(scans.doppler_mps, rows)
+        options: dict[str, Any] = {"imu": imu, "config": config, "progress": False}
+        found = odometry(own, doppler_mps=doppler_mps, times_s=times_s, **options)
+        part = found.longest_segment()
+        given, notes, times_s = False, found.report["notes"], times_s[part]
+        path = found.poses[part] @ np.linalg.inv(T_body_sensor)
+    rising = np.append(True, np.diff(times_s) > 0)
+    return times_s[rising], path[rising], given, notes
 
 
 def _turning_part(times_s: Floats, poses: Floats, most_s: float) -> tuple[float, float]:
