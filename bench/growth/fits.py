@@ -14,7 +14,7 @@ import radarsdf.fitting.fit
 import radarsdf.poses.refine  # like fitting.fit: else the first call would import it, in what is measured
 from radarsdf import FitConfig, RadarMap
 from radarsdf._core import count_visibility
-from radarsdf.fitting.occupied_cells import near_leaf_keys
+from radarsdf.fitting.surface_returns import near_leaf_keys
 from radarsdf.poses.rigid import steps, turned_by
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import sensor_noise

@@ -67,7 +67,7 @@ void bind_poses(py::module_& m) {
       .def(py::init([](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
                        const Array<std::int32_t>& scans, const Array<std::int32_t>& planes,
                        const Array<double>& positions, const Array<double>& up_of_scan, const Array<double>& centres,
-                       const Array<double>& normals, double extent_m, const VarianceNumbers& variances,
+                       const Array<double>& normals, double extent_m, const Array<double>& noise,
                        std::int64_t scans_together, int num_threads) {
              const std::int64_t count = check_rays(points, directions, ranges_m);
              const std::int64_t num_scans = check_points(positions, "positions");
@@ -76,31 +76,45 @@ void bind_poses(py::module_& m) {
              check_shape(planes, {count}, "planes");
              check_shape(up_of_scan, {num_scans, 3}, "up_of_scan");
              check_shape(normals, {num_planes, 3}, "normals");
+             check_shape(noise, {num_scans, 3}, "noise");
              check_numbers(planes, -1, num_planes, "planes");
              check_numbers(scans, 0, num_scans, "scans");
              if (!std::is_sorted(scans.data(), scans.data() + count)) throw std::invalid_argument("scans must ascend");
-             const PosedReturns returns{points.data(),    directions.data(), ranges_m.data(),
-                                        scans.data(),     planes.data(),     count,
-                                        positions.data(), up_of_scan.data(), num_scans};
+             const PosedReturns returns{
+                 points.data(), directions.data(), ranges_m.data(),   scans.data(), planes.data(),
+                 count,         positions.data(),  up_of_scan.data(), noise.data(), num_scans};
              if (!(extent_m > 0) || scans_together < 1) {
                throw std::invalid_argument("extent_m and scans_together must be positive");
              }
              const PlanesOfScans of_scans{centres.data(), normals.data(), num_planes, extent_m};
-             const ReturnVariances noise = variances_of(variances);
              const py::gil_scoped_release release;
-             return std::make_unique<CommonPlanes>(returns, of_scans, noise, scans_together, num_threads);
+             return std::make_unique<CommonPlanes>(returns, of_scans, scans_together, num_threads);
            }),
            "points"_array, "directions"_array, "ranges_m"_array, "scans"_array, "planes"_array, "positions"_array,
-           "up_of_scan"_array, "centres"_array, "normals"_array, "extent_m"_a, "variances"_a, "scans_together"_a,
+           "up_of_scan"_array, "centres"_array, "normals"_array, "extent_m"_a, "noise"_array, "scans_together"_a,
            "num_threads"_a = 0,
            "Points (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, "
            "ascending; `planes` (N,) int32, -1 for none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` "
-           "(P, 3) float64. `extent_m` of a plane; `variances` along the beam, m^2, in azimuth and elevation, rad^2.")
+           "(P, 3) float64. `extent_m` of a plane; `noise` (F, 3) float64: variances along the beam, m^2, in azimuth "
+           "and "
+           "elevation, rad^2.")
       .def_property_readonly("scale", &CommonPlanes::scale,
                              "Median squared normalised residual, relative to that of Gaussian noise; at least 1.")
       .def_property_readonly(
           "weights", [](const CommonPlanes& planes) { return to_array(std::vector<double>(planes.weights())); },
           "Sums of the weights, each at most 1, of the returns of each scan: (F,) float64.")
+      .def_property_readonly(
+          "equations",
+          [](const CommonPlanes& planes) {
+            return py::make_tuple(to_array(std::vector<double>(planes.diagonal())),
+                                  to_array(std::vector<double>(planes.gradient())),
+                                  to_array(std::vector<double>(planes.coupling())),
+                                  to_array(std::vector<std::int32_t>(planes.scan_of_cluster())),
+                                  to_array(std::vector<std::int64_t>(planes.first_of_plane())));
+          },
+          "Matrix and vector of the normal equations, flat: diagonal blocks (F, 6, 6), gradient (F, 6), and blocks (C, "
+          "3, "
+          "6) of a matrix whose square is subtracted, with the scan (C,) of each and the first (P + 1,) of each plane.")
       .def(
           "solve",
           [](const CommonPlanes& planes, const Array<double>& diagonal, const Array<double>& below,

@@ -89,7 +89,6 @@ struct PlaneSums {
 struct CommonPlanes::Input {
   const PosedReturns& returns;
   const PlanesOfScans& planes;
-  const ReturnVariances& noise;
   std::vector<std::int64_t> first = {};  // (planes + 1), in `rows`
   std::vector<std::int32_t> rows = {};   // indices of returns by plane, in the order of scans
   std::vector<float> weights = {};       // by return; 0 if only one scan observes its plane
@@ -112,22 +111,22 @@ struct CommonPlanes::Input {
     found.along[0] = 1;
     found.along[1] = dot(off, e1) / planes.extent_m;
     found.along[2] = dot(off, e2) / planes.extent_m;
-    found.variance =
-        variance_along(n, vec3(returns.directions, i), returns.ranges_m[i], vec3(returns.up_of_scan, scan), noise);
+    found.variance = variance_along(n, vec3(returns.directions, i), returns.ranges_m[i], vec3(returns.up_of_scan, scan),
+                                    variances_of(returns.noise_of_scan + 3 * scan));
     store(n, found.jacobian);
     store(cross(arm, n), found.jacobian + 3);
     return found;
   }
 };
 
-CommonPlanes::CommonPlanes(const PosedReturns& returns, const PlanesOfScans& planes, const ReturnVariances& noise,
-                           std::int64_t scans_together, int num_threads)
+CommonPlanes::CommonPlanes(const PosedReturns& returns, const PlanesOfScans& planes, std::int64_t scans_together,
+                           int num_threads)
     : num_scans_(returns.num_scans),
       width_(std::min(scans_together, returns.num_scans) - 1),
       weights_(returns.num_scans),
       diagonal_(kBlock * returns.num_scans),
       gradient_(kPose * returns.num_scans) {
-  Input input{returns, planes, noise};
+  Input input{returns, planes};
   find_clusters(input);
   find_scale(input, num_threads);
   eliminate_planes(input, num_threads);

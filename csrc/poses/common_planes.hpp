@@ -17,8 +17,9 @@ struct PosedReturns {
   const std::int32_t* scans;   ///< (count), ascending
   const std::int32_t* planes;  ///< (count), the plane of each return; -1: none
   std::int64_t count;
-  const double* positions;   ///< (scans, 3), of the sensor
-  const double* up_of_scan;  ///< (scans, 3), the z axis of the sensor
+  const double* positions;      ///< (scans, 3), of the sensor
+  const double* up_of_scan;     ///< (scans, 3), the z axis of the sensor
+  const double* noise_of_scan;  ///< (scans, 3), variances along the beam, m^2, in azimuth and elevation, rad^2
   std::int64_t num_scans;
 };
 
@@ -37,13 +38,18 @@ struct PlanesOfScans {
 class CommonPlanes {
  public:
   // In the factored band of the matrix, a plane couples at most `scans_together` neighbouring scans.
-  CommonPlanes(const PosedReturns& returns, const PlanesOfScans& planes, const ReturnVariances& noise,
-               std::int64_t scans_together, int num_threads);
+  CommonPlanes(const PosedReturns& returns, const PlanesOfScans& planes, std::int64_t scans_together, int num_threads);
 
   // Ratio of the median of the normalised squared residuals to that of a normal distribution, at least 1. It scales all
   // variances, since wrong poses inflate residuals.
   double scale() const { return scale_; }
   const std::vector<double>& weights() const { return weights_; }  // (scans), sums over returns, each in [0, 1]
+  // H is block diagonal, less C^T C with the blocks `coupling` of `scan_of_cluster` in the three rows of each plane.
+  const std::vector<double>& diagonal() const { return diagonal_; }
+  const std::vector<double>& gradient() const { return gradient_; }
+  const std::vector<double>& coupling() const { return coupling_; }
+  const std::vector<std::int32_t>& scan_of_cluster() const { return scan_of_cluster_; }
+  const std::vector<std::int64_t>& first_of_plane() const { return first_of_plane_; }
 
   // Solves (H + P) x = -(g + q) for the increments x (scans, 6): H and g are of the planes; P (prior) is block
   // tridiagonal, diagonal (scans, 6, 6), below (scans - 1, 6, 6), and q (scans, 6) its gradient. By conjugate

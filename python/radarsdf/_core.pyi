@@ -697,14 +697,12 @@ class CommonPlanes:
         centres: numpy.typing.NDArray[numpy.float64],
         normals: numpy.typing.NDArray[numpy.float64],
         extent_m: typing.SupportsFloat | typing.SupportsIndex,
-        variances: typing.Annotated[
-            collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-        ],
+        noise: numpy.typing.NDArray[numpy.float64],
         scans_together: typing.SupportsInt | typing.SupportsIndex,
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
     ) -> None:
         """
-        Points (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, ascending; `planes` (N,) int32, -1 for none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` (P, 3) float64. `extent_m` of a plane; `variances` along the beam, m^2, in azimuth and elevation, rad^2.
+        Points (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, ascending; `planes` (N,) int32, -1 for none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` (P, 3) float64. `extent_m` of a plane; `noise` (F, 3) float64: variances along the beam, m^2, in azimuth and elevation, rad^2.
         """
     def solve(
         self,
@@ -723,6 +721,19 @@ class CommonPlanes:
     ]:
         """
         Increments (F, 6) of the poses: translation, and rotation vector applied from the left about the sensor; blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), `with_inverse`; squared Mahalanobis norm of the increments. The prior is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, 6, 6), `gradient` (F, 6), all float64.
+        """
+    @property
+    def equations(
+        self,
+    ) -> tuple[
+        numpy.typing.NDArray[numpy.float64],
+        numpy.typing.NDArray[numpy.float64],
+        numpy.typing.NDArray[numpy.float64],
+        numpy.typing.NDArray[numpy.int32],
+        numpy.typing.NDArray[numpy.int64],
+    ]:
+        """
+        Matrix and vector of the normal equations, flat: diagonal blocks (F, 6, 6), gradient (F, 6), and blocks (C, 3, 6) of a matrix whose square is subtracted, with the scan (C,) of each and the first (P + 1,) of each plane.
         """
     @property
     def scale(self) -> float:

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +23,8 @@ MISSING_POSES = (
     "poses are missing: T_world_sensor (4, 4) of each scan; "
     "radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
 )
+
+AnyPath: TypeAlias = str | os.PathLike[str]
 
 _Kind = TypeVar("_Kind")
 
@@ -154,17 +156,12 @@ def are_rigid(poses: Floats) -> Bools:
     rotation = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # non-finite matrices are not rigid
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        rigid: Bools = (
-            (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
-            & (rotation_error < _MAX_ROTATION_ERROR)
-            & (np.linalg.det(rotation) > 0)
-            & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
-        )
-    return rigid
+        proper = (rotation_error < _MAX_ROTATION_ERROR) & (np.linalg.det(rotation) > 0)
+        within = (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
+    return proper & within & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:
-    """Return `value` if it is an instance of `kind`, else raise a TypeError."""
     if not isinstance(value, kind):
         raise _wrong_type(name, f"a {kind.__name__}", value)
     return value
@@ -179,14 +176,12 @@ def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
 
 
 def path_of(value: Any, name: str) -> Path:
-    """Convert to a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise _wrong_type(name, "a path", value)
     return Path(value)
 
 
 def flag(value: Any, name: str) -> bool:
-    """Convert to a bool."""
     if not isinstance(value, (bool, np.bool_)):
         raise _wrong_type(name, "True or False", value)
     return bool(value)

@@ -24,7 +24,6 @@ class WorldLattice(NamedTuple):
 
     @property
     def block_m(self) -> float:
-        """Edge of a block, m."""
         return self.block_cells * self.cell_m
 
     def position(self, cells: ArrayLike) -> Floats:

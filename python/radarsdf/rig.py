@@ -63,12 +63,9 @@ class Rig:
     @property
     def mountings(self) -> Floats:
         """(F, 4, 4) T_body_sensor of each scan, m; the identity if unknown."""
-        count = len(self.of_scan)
-        return (
-            np.tile(np.eye(4), (count, 1, 1))
-            if self.T_body_sensor is None
-            else self.T_body_sensor[self.of_scan]
-        )
+        if self.T_body_sensor is None:
+            return np.tile(np.eye(4), (len(self.of_scan), 1, 1))
+        return self.T_body_sensor[self.of_scan]
 
     def sensor_poses(self, poses: Floats) -> Floats:
         """Return T_world_sensor (F, 4, 4) of the scans from their `poses` (F, 4, 4), m."""
@@ -91,5 +88,4 @@ class Rig:
         return {self.labels[i]: np.flatnonzero(self.of_scan == i) for i in np.unique(self.of_scan)}
 
     def select(self, rows: slice | Ints | Sequence[int]) -> Rig:
-        """Select scans."""
         return Rig(self.labels, self.of_scan[rows], self.T_body_sensor)

@@ -68,12 +68,8 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
         return scan
     what = "returns left out: a coordinate or the intensity is not a finite number"
     notes.count(what, int((~finite).sum()))
-    columns = {
-        "points": points,
-        "intensities": intensities,
-        "doppler_mps": scan.doppler_mps,
-        "sigma": scan.sigma,
-    }
+    names = ("points", "intensities", "doppler_mps", "sigma")
+    columns = {name: getattr(scan, name) for name in names}
     kept: dict[str, Any] = {name: array[finite] for name, array in columns.items() if array is not None}
     return dataclasses.replace(scan, **kept)
 
@@ -257,13 +253,14 @@ class Scans:
 
         Negative indices count from the end. Ground truth and IMU stay the same. Raises an IndexError if one is out of range.
         """
-        scans = self.with_poses(self.poses[frames])
-        scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
+        arrays = {name: chosen(values, frames) for name, values in self._loaded().items()}
+        scans = self.with_poses(None if self._poses is None else self._poses[frames])
+        scans._arrays = arrays
         scans._times_s = None if self._times_s is None else self._times_s[frames]
         scans._rig = None if self._rig is None else self._rig.select(frames)
         return scans
 
-    def with_poses(self, poses: Floats, *, other_world: bool = False) -> Scans:
+    def with_poses(self, poses: Floats | None, *, other_world: bool = False) -> Scans:
         """Return the same scans with other `poses` (F, 4, 4) float64, m. All scans are read.
 
         `other_world`: whether these are in another world frame than the ground truth, which is then dropped.
@@ -331,16 +328,18 @@ def scans_in_memory(scans: Sequence[Scan]) -> Scans:
 
 
 def filled(points: Any, **given: Any) -> tuple[Any, ...]:
-    """Fill missing arrays from `points`, if these are `Scans`; arrays are named as in :class:`Scans`."""
-    if not isinstance(points, Scans):
-        return points, *given.values()
-    arrays = points.points  # first, since it reads everything in one pass
-    return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
+    """Return the rig, the scans and the values `given` by names of :class:`Scans`, if `points` are those; else no rig.
 
-
-def rig_of(points: Any) -> Rig | None:
-    """Return the radars of `points`, if these are `Scans` of several."""
-    return points.rig if isinstance(points, Scans) else None
+    Missing values are those of the `Scans`. Raises a ValueError if poses are missing.
+    """
+    rig = None
+    if isinstance(points, Scans):
+        scans, points = points, points.points  # reads everything in one pass
+        rig = scans.rig
+        given = {name: getattr(scans, name) if values is None else values for name, values in given.items()}
+    if given.get("poses", points) is None:
+        raise ValueError(MISSING_POSES)
+    return rig, points, *given.values()
 
 
 def chosen(arrays: Sequence[Any] | None, numbers: Ints | Sequence[int]) -> list[Any] | None:

@@ -31,11 +31,8 @@ _VECTOR_LENGTH = 1024  # elements: enough for vectors, too few for PyTorch to sp
 
 _wanted, _known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
 if _wanted and _wanted not in _known:  # the core keeps its own choice
-    warnings.warn(
-        f"RADARSDF_ISA={_wanted!s:.50} is none of {', '.join(_known)}: {_core.instruction_set()} is used",
-        RuntimeWarning,
-        stacklevel=2,
-    )
+    used = f"{', '.join(_known)}: {_core.instruction_set()} is used"
+    warnings.warn(f"RADARSDF_ISA={_wanted!s:.50} is none of {used}", RuntimeWarning, stacklevel=2)
 
 
 class _State:

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.checking.drift import check_drift
-from radarsdf.checking.piecewise import check_order
+from radarsdf.checking.drift import check_drift, check_order
 from radarsdf.checking.recording import checked_input
 from scipy.spatial.transform import Rotation
 

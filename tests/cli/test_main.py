@@ -11,9 +11,8 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.cli import main
 from radarsdf.cli.app import message_of
-from radarsdf.cli.commands import COMMANDS, TILE_STEPS
 from radarsdf.cli.inputs import read_scans
-from radarsdf.cli.options import OPTIONS, Parser
+from radarsdf.cli.options import COMMANDS, OPTIONS, TILE_STEPS, Parser
 from radarsdf.cli.results import Results
 from radarsdf.cli.settings import load_config
 

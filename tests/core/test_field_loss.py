@@ -10,8 +10,8 @@ import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.gradients import AutogradGradients, CoreGradients
-from radarsdf.fitting.occupied_cells import near_leaf_keys
 from radarsdf.fitting.sampling import Batch, RaySampler
+from radarsdf.fitting.surface_returns import near_leaf_keys
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import ThreadPool
 

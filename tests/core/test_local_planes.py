@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from radarsdf._core import CommonPlanes, LocalPlanes
 from radarsdf.poses.rigid import moved
+from scipy import sparse
+from scipy.linalg import block_diag
 
 VARIANCES = [0.02**2, 0.002**2, 0.002**2]
 
@@ -95,7 +97,7 @@ def test_scores_fall_with_the_distance():
 
 
 SCANS, PLANES, EXTENT_M = 7, 12, 0.8
-SPREAD = [0.05**2, 0.01**2, 0.02**2]
+SPREAD = np.outer(np.linspace(1, 2, SCANS), [0.05**2, 0.01**2, 0.02**2])  # of each scan
 
 
 def returns(seed=0, count=600):
@@ -134,7 +136,7 @@ def dense(given, scale):
             azimuth = np.cross(up[scans[i]], d)
             azimuth /= np.linalg.norm(azimuth)
             axes = np.stack([d, azimuth, np.cross(d, azimuth)]) @ n
-            variance = scale * (axes**2 @ (np.array(SPREAD) * [1, ranges_m[i] ** 2, ranges_m[i] ** 2]))
+            variance = scale * (axes**2 @ (SPREAD[scans[i]] * [1, ranges_m[i] ** 2, ranges_m[i] ** 2]))
             off = points[i] - centres[p]
             r = off @ n
             w = (1 + r**2 / (4 * variance)) ** -2 / variance
@@ -169,6 +171,12 @@ def test_increments_equal_the_dense_solution(together):
     seen = [p for p in range(PLANES) if len(set(scans[planes == p])) > 1]
     assert 5 < len(seen) < PLANES
     H, g = dense(given, found.scale)
+    diagonal, gradient, coupling, of_cluster, first = found.equations
+    C = sparse.bsr_matrix((coupling.reshape(-1, 3, 6), of_cluster, first), (3 * PLANES, 6 * SCANS)).toarray()
+    np.testing.assert_allclose(
+        block_diag(*diagonal.reshape(-1, 6, 6)) - C.T @ C, H, atol=1e-5 * np.abs(H).max()
+    )
+    np.testing.assert_allclose(gradient, g, atol=1e-5 * np.abs(g).max())
     diagonal, below, gradient, whole = prior(np.random.default_rng(1))
     x, inverse, inverse_below, decrement = found.solve(diagonal, below, gradient, 1e-10, 200, True, 2)
     expected = -np.linalg.solve(H + whole, g + gradient.reshape(-1))
@@ -192,7 +200,7 @@ def test_the_scale_is_the_median_squared_residual():
     for sigma_m in (0.01, 0.05, 0.2):
         off = rng.normal(0, sigma_m, len(points))[:, None] * normals[planes]
         given[0] = (centres[planes] + off).astype(np.float32)
-        isotropic = [0.05**2, (0.05 / ranges_m.max()) ** 2, (0.05 / ranges_m.max()) ** 2]
+        isotropic = np.tile([0.05, *[0.05 / ranges_m.max()] * 2], (SCANS, 1)) ** 2
         given[2] = np.full(len(points), ranges_m.max(), np.float32)
         scales.append(CommonPlanes(*given, EXTENT_M, isotropic, SCANS).scale)
     np.testing.assert_allclose(scales, [1, 1, 16], rtol=0.1)

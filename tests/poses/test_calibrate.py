@@ -16,7 +16,7 @@ LATE_S = 0.02
 ERRORS = np.array(
     [0.15, -0.1, 0.1, *np.radians([2.0, -1.5, 3.0])]
 )  # of the given mounting of the side radar: m, rad
-COUNT, INTERVAL_S = 40, 0.25
+COUNT, INTERVAL_S, RATE_HZ = 40, 0.25, 5.0
 
 
 def driven(seed=0, straight=False):
@@ -30,14 +30,14 @@ def driven(seed=0, straight=False):
     }
     poses = base.poses
     if straight:
-        poses = np.tile(poses[0], (COUNT, 1, 1))
-        poses[:, :3, 3] += np.outer(0.4 * np.arange(COUNT), poses[0, :3, 0])
+        poses = np.tile(poses[0], (COUNT // 2, 1, 1))
+        poses[:, :3, 3] += np.outer(0.8 * np.arange(len(poses)), poses[0, :3, 0])
     radars = {
-        "front": MountedRadar(radar, true["front"]),
-        "side": MountedRadar(wide, true["side"], first_s=0.03, time_offset_s=LATE_S),
+        "front": MountedRadar(radar, true["front"], RATE_HZ),
+        "side": MountedRadar(wide, true["side"], RATE_HZ, first_s=0.03, time_offset_s=LATE_S),
     }
     return (
-        simulate_rig(base.scene, radars, poses, INTERVAL_S * np.arange(COUNT), seed=seed).scans,
+        simulate_rig(base.scene, radars, poses, INTERVAL_S * np.arange(len(poses)), seed=seed).scans,
         true,
         poses,
     )

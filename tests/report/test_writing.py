@@ -220,7 +220,7 @@ def surface(kinds):
 def test_each_change_is_named_listed_and_shown(kinds, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    from radarsdf.report import changes as module  # noqa: PLC0415
+    from radarsdf.report import writing as module  # noqa: PLC0415
 
     scene, shown = module.scene, []
     monkeypatch.setattr(module, "scene", lambda *mesh: shown.append(mesh) or scene(*mesh))

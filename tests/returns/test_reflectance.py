@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.evaluation import KNNIntensity, holdout
-from radarsdf.fitting import closed_form
+from radarsdf.fitting import steps
 from radarsdf.returns import intensities as plausible
 from radarsdf.returns import reflectance, sensor
 from radarsdf.returns.intensities import Intensities, Plausible
@@ -228,7 +228,7 @@ def test_limits_of_parts_equal_those_of_the_whole(monkeypatch, most):
 def test_intensities_do_not_depend_on_the_order_of_scans(monkeypatch, many):
     if many:
         for module, name, value in (
-            (closed_form, "_ENOUGH_RETURNS", 3000), (closed_form, "_ENOUGH_PER_PLANE", 0), (plausible, "_MOST", 1000),
+            (steps, "_ENOUGH_RETURNS", 3000), (steps, "_ENOUGH_PER_PLANE", 0), (plausible, "_MOST", 1000),
             (reflectance, "_MOST_RETURNS", 1000), (sensor, "_MAX_RETURNS", 1000),
         ):  # fmt: skip
             monkeypatch.setattr(module, name, value)

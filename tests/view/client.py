@@ -13,7 +13,7 @@ import numpy as np
 import viser
 import zstandard
 from numpy.typing import NDArray
-from radarsdf.view import glb
+from radarsdf.view import surface as glb
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from radarsdf.io import Scans
 from radarsdf.map.colors import intensity_colors
-from radarsdf.view.glb import shaded
+from radarsdf.view.surface import shaded
 from radarsdf.view.viewer import Viewer
 from scipy.spatial import cKDTree
 

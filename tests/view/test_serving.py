@@ -5,7 +5,7 @@ import sys
 
 import pytest
 from radarsdf.view import serving
-from radarsdf.view.guarding import refusal
+from radarsdf.view.serving import refusal
 
 
 def test_a_port_in_use_is_rejected(monkeypatch):

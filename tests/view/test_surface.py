@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf.map.threshold import Threshold
-from radarsdf.view.framing import FOV_RAD, framing_pose
-from radarsdf.view.glb import glb
-from radarsdf.view.surface import ShownSurface, first_hit, spread_evenly, thinned
+from radarsdf.view.serving import FOV_RAD, framing_pose
+from radarsdf.view.surface import ShownSurface, first_hit, glb, spread_evenly, thinned
 from scipy.spatial import cKDTree
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)

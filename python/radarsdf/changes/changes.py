@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
-from radarsdf.checks import path_of
+from radarsdf.checks import AnyPath, path_of
 from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.threshold import across_triangles
 
@@ -116,14 +115,13 @@ class Changes:
                 for faces in np.split(rows[np.argsort(labels, kind="stable")], ends) if len(rows) else []:
                     vertices = np.unique(surface.faces[faces])
                     x = surface.vertices[vertices]
-                    region = Region(
-                        NAMES[kind],
-                        np.stack([x.min(axis=0), x.max(axis=0)]),
-                        float(areas[faces].sum()),
-                        float(surface.probability[vertices].mean()),
-                        _mean(surface.moved_m[vertices]) if kind == MOVED else None,
-                        _mean(surface.intensity_change[vertices]) if kind == REFLECTANCE_CHANGED else None,
+                    box, area_m2 = np.stack([x.min(axis=0), x.max(axis=0)]), float(areas[faces].sum())
+                    probability = float(surface.probability[vertices].mean())
+                    moved_m = _mean(surface.moved_m[vertices]) if kind == MOVED else None
+                    brighter = (
+                        _mean(surface.intensity_change[vertices]) if kind == REFLECTANCE_CHANGED else None
                     )
+                    region = Region(NAMES[kind], box, area_m2, probability, moved_m, brighter)
                     if region.area_m2 >= min_area_m2:
                         found.append(region)
         return sorted(found, key=lambda region: -region.area_m2)
@@ -146,13 +144,12 @@ class Changes:
         faces = np.concatenate([self.after.faces, lost + np.int32(len(self.after.vertices))])
         mesh: Any = trimesh.Trimesh(vertices, faces, process=False)
         for name in ("kind", "probability", "moved_m", "intensity_change"):
-            mesh.vertex_attributes[name] = np.concatenate(
-                [getattr(self.after, name), getattr(self.before, name)[used]]
-            )
+            after, before = (getattr(side, name) for side in (self.after, self.before))
+            mesh.vertex_attributes[name] = np.concatenate([after, before[used]])
         mesh.visual.vertex_colors = colors_of(mesh.vertex_attributes["kind"])
         return mesh
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the mesh of :meth:`mesh` by :func:`radarsdf.io.write_mesh`, with its formats and errors."""
         from radarsdf.io.meshes import write_mesh  # noqa: PLC0415 - as above
 
@@ -161,10 +158,8 @@ class Changes:
 
 def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
     kinds, areas_m2 = (np.concatenate(of) for of in zip(*(s.of_faces() for s in surfaces), strict=True))
-    return {
-        "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},
-        "compared_m2": float(areas_m2[kinds != UNSEEN].sum()),
-    }
+    of_kinds = {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED}
+    return {"areas_m2": of_kinds, "compared_m2": float(areas_m2[kinds != UNSEEN].sum())}
 
 
 def colors_of(kinds: NDArray[np.int8]) -> Bytes:

@@ -109,14 +109,10 @@ class PlacedMap:
         distance_m, normals = self.radar_map.tangent_planes(own)
         normals = turned(normals, self.T_common_map[:3, :3])
         behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
-        return PlaceEvidence(
-            distance_m,
-            normals,
-            uncertainty(contents, evidence).astype(np.float64),
-            confidence(contents, evidence).astype(np.float64),
-            evidence.hits.astype(np.float64),
-            self._passes(self.to_own(behind)),
-        )
+        known = uncertainty(contents, evidence), confidence(contents, evidence), evidence.hits
+        uncertainty_m, probability, hits = (values.astype(np.float64) for values in known)
+        passes = self._passes(self.to_own(behind))
+        return PlaceEvidence(distance_m, normals, uncertainty_m, probability, hits, passes)
 
     def _passes(self, own: Floats) -> Floats:
         """(N,) :attr:`PlaceEvidence.passes` of places (N, 3), world of the map, m."""
@@ -188,10 +184,8 @@ class Errors:
     @classmethod
     def of(cls, sides: Sequence[Side]) -> Errors:
         """Fit by maximum likelihood, with an unknown share of the distances to other surfaces within reach."""
-        columns = [
-            np.stack([s.other.distance_m, s.sigma_m, np.full(len(s.sigma_m), s.reach_m)])[:, s.observed]
-            for s in sides
-        ]
+        within = ((side, np.full(len(side.sigma_m), side.reach_m)) for side in sides)
+        columns = [np.stack([s.other.distance_m, s.sigma_m, reach_m])[:, s.observed] for s, reach_m in within]
         known = np.concatenate(columns, axis=1)
         if known.size == 0:
             return cls(_FREEDOMS[-1], 1.0)

@@ -92,11 +92,8 @@ class Differences:
             return "Reflectance was not compared: spreads of intensities from equal views imply other units."
         values = second[1] / second[0] - first[1] / first[0]
         offset = float(np.median(values))
-        between = _Means(
-            ((first[3:] + second[3:]) / (first[0] + second[0])).T,
-            values - offset,
-            days[0].sigma ** 2 / first[0] + days[1].sigma ** 2 / second[0],
-        )
+        variances = days[0].sigma ** 2 / first[0] + days[1].sigma ** 2 / second[0]
+        between = _Means(((first[3:] + second[3:]) / (first[0] + second[0])).T, values - offset, variances)
         within = []
         for number, day in enumerate(days):
             rest = day.intensities - expected[number][of_day == number]

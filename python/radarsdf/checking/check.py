@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Bools, Ints
-from radarsdf.checking import drift, frames, noise, piecewise, trajectory
+from radarsdf.checking import drift, frames, noise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.mounting import check_mountings, misread_radars
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
-from radarsdf.checks import MISSING_POSES, are_rigid, instance, pose_matrices
+from radarsdf.checks import are_rigid, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import measured, too_far
-from radarsdf.scans import Scans, filled, rig_of
+from radarsdf.scans import Scans, filled
 
 _EQUAL = 1e-6  # relative difference of equal ranges, from float32
 # A largest range is too frequent if more than 8 returns, and 5 times as many as at each of the next 10 ranges, have it.
@@ -73,12 +73,9 @@ def check(
     ('poses_inverted', 'error')
     """
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    scans, poses, intensities, doppler_mps, times_s = filled(
+    rig, scans, poses, intensities, doppler_mps, times_s = filled(
         points, poses=poses, intensities=intensities, doppler_mps=doppler_mps, times_s=times_s
     )
-    if poses is None:
-        raise ValueError(MISSING_POSES)
-    rig = rig_of(points)
     if rig is None:
         return _find(checked_input(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
     T_world_sensor = rig.sensor_poses(pose_matrices(poses, len(rig.of_scan)))
@@ -134,7 +131,7 @@ def _sorted(found: list[Finding]) -> list[Finding]:
 
 def _drift(recording: Scans, numbers: Ints, config: FitConfig, found: list[Finding]) -> list[Finding]:
     """Exchanged scans, which refined poses would hide, or drift of the poses or what explains it better."""
-    faults = list(piecewise.check_order(recording, numbers)) or list(drift.check_drift(recording, config))
+    faults = list(drift.check_order(recording, numbers)) or list(drift.check_drift(recording, config))
     unknown = any(finding.name == "motion_undecided" for finding in found)
     return [
         Finding("undecided", "warning", fault.evidence) if unknown and fault.name == "poses_drift" else fault
@@ -177,9 +174,8 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         recording = _without(recording, left_out)
     empty = np.array([mask.all() for mask in left_out])
     if empty.any():
-        evidence = (
-            f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
-        )
+        count, first = f"{empty.sum()} of {len(empty)}", np.argmax(empty)
+        evidence = f"{count} scans have no returns, the first is scan {first}."
         found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
     if not empty.all():
         found += trajectory.check_rigid(recording)
@@ -190,10 +186,8 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
 
 def _far(recording: Scans, returns: list[Bools], num_far: int) -> Iterator[Finding]:
     """Report returns that a fit leaves out as too far away, and a farthest range that is much too frequent."""
-    lengths = [
-        np.linalg.norm(scan[mask], axis=1) for scan, mask in zip(recording.points, returns, strict=True)
-    ]
-    ranges = np.concatenate(lengths)
+    pairs = zip(recording.points, returns, strict=True)
+    ranges = np.concatenate([np.linalg.norm(scan[mask], axis=1) for scan, mask in pairs])
     most = ranges.max(initial=0.0)
     counts = np.unique((np.log(ranges / most) / _EQUAL).round(), return_counts=True)[1]
     if num_far:

@@ -29,14 +29,12 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
         yield Finding("intensity_is_doppler", "error", evidence)
     if recording.doppler_mps is None:
         return
-    scans, velocities = _velocities(recording, recording.doppler_mps)
+    scans, velocities = velocities_of_some(recording, recording.doppler_mps)
     good = np.array([velocity.found for velocity in velocities], bool)
     tried, without = len(scans), int((~good).sum())
     if tried - without < max(_MIN_SCANS, tried // 2):
         if tried >= _MIN_SCANS:
-            evidence = (
-                f"In {without} of {tried} scans no velocity of the sensor fits 40 % of the Doppler values."
-            )
+            evidence = f"In {without} of {tried} scans no velocity fits 40 % of the Doppler values."
             yield Finding("doppler_without_velocity", "warning", evidence)
         return
     static = np.concatenate([velocity.static for velocity in velocities if velocity.found])
@@ -47,7 +45,7 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
     yield from _compared_with_poses(recording, scans[good], by_doppler)
 
 
-def _velocities(recording: Scans, values: list[Array]) -> tuple[Ints, list[SensorVelocity]]:
+def velocities_of_some(recording: Scans, values: list[Array]) -> tuple[Ints, list[SensorVelocity]]:
     """Velocities of some scans from `values`, which may be Doppler, and the scans."""
     scans = [i for i in some_scans(recording) if len(recording.points[i]) >= MIN_DOPPLER_RETURNS]
     found = sensor_velocities([recording.points[i] for i in scans], [values[i] for i in scans])
@@ -58,7 +56,7 @@ def _are_speeds(recording: Scans, values: list[Array]) -> bool:
     """Whether values (N_i,) of the scans are Doppler: most scans fit a velocity, which is not zero in all."""
     if min(float(np.min(value, initial=0)) for value in values) >= 0:
         return False  # Doppler has both signs, or a negative one for approaching returns
-    scans, velocities = _velocities(recording, values)
+    scans, velocities = velocities_of_some(recording, values)
     found = [velocity.velocity_mps for velocity in velocities if velocity.found]
     if len(scans) < _MIN_SCANS or len(found) < 0.7 * len(scans):
         return False
@@ -95,10 +93,8 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
     yaw = float(np.median(yaws))
     spread = 1.4826 * float(np.median(np.abs(yaws - yaw))) * np.sqrt(np.pi / 2 / len(yaws))
     if abs(yaw) > max(_MIN_YAW_RAD, _MIN_SIGNIFICANCE * spread):
-        evidence = (
-            f"The poses move {np.degrees(yaw):+.1f} degrees to the left of the Doppler velocity, in the median of "
-            f"{len(yaws)} scans."
-        )
+        degrees, over = np.degrees(yaw), f"the median of {len(yaws)} scans"
+        evidence = f"The poses move {degrees:+.1f} degrees to the left of the Doppler velocity, {over}."
         yield Finding("sensor_turned", "warning", evidence)
 
 

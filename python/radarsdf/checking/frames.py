@@ -75,9 +75,8 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     agreement = Agreement(recording.points, effort.returns, effort.queries)
     guesses = hypotheses(poses, pairs, all_axes=effort.all_axes)
     motions = relative(poses, pairs)
-    scores = agreement.scores(
-        pairs, np.stack([motions, *(guess.T_j_i for guess in guesses), relative(poses, pairs[:, ::-1])])
-    )
+    others = [guess.T_j_i for guess in guesses]
+    scores = agreement.scores(pairs, np.stack([motions, *others, relative(poses, pairs[:, ::-1])]))
     forwards = Comparison.of(scores[-1], scores[:1])
     in_world = not (forwards.gains[0] > _FORWARDS_GAIN and forwards.significance[0] > _MIN_SIGNIFICANCE)
     in_world = in_world and not _looks_out_of_its_frame(recording, pairs)
@@ -101,7 +100,6 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
 
 
 def _severity(gain: float, finding: str) -> Severity:
-    """Severity of a finding by its gain in agreement."""
     return "error" if gain >= _ERROR_GAINS.get(finding, _ERROR_GAIN) else "note"
 
 
@@ -197,9 +195,7 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
     afar = [np.linalg.norm(np.median(scan, axis=0)) / max(scan.std(axis=0).max(), 1e-9) for scan in given]
     if np.median(afar) > _AFAR:
         return False  # no sensor has all returns in one direction, unlike UTM coordinates
-    moved = [
-        (scan - pose[:3, 3]) @ pose[:3, :3] for scan, pose in zip(given, recording.poses[rows], strict=True)
-    ]
+    moved = [(scan - T[:3, 3]) @ T[:3, :3] for scan, T in zip(given, recording.poses[rows], strict=True)]
     first, second = np.searchsorted(rows, pairs.T)
     significances = []
     for of_scan in (functools.partial(np.median, axis=0), _mean_direction):

@@ -8,12 +8,11 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checking.agreement import Agreement, Comparison, choose_pairs
-from radarsdf.checking.doppler import velocity_of_poses
-from radarsdf.checking.recording import Finding
+from radarsdf.checking.doppler import velocities_of_some, velocity_of_poses
+from radarsdf.checking.recording import Finding, ascending_times_s
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.calibrate import calibrate
 from radarsdf.poses.rigid import increments
-from radarsdf.returns.moving import sensor_velocities
 from radarsdf.rig import Label
 from radarsdf.scans import Scans
 
@@ -66,18 +65,16 @@ def misread_radars(recording: Scans) -> Iterator[tuple[Label, Finding]]:
         own = pairs[(rig.of_scan[pairs] == k).any(axis=1)]
         if len(own) == 0:
             continue
-        changed = np.where(
-            (rig.of_scan == k)[:, None, None, None], poses[:, None] @ turns, poses[:, None]
-        ).swapaxes(0, 1)
+        own_scans = (rig.of_scan == k)[:, None, None, None]
+        changed = np.where(own_scans, poses[:, None] @ turns, poses[:, None]).swapaxes(0, 1)
         T_j_i = np.stack([np.linalg.inv(each[own[:, 1]]) @ each[own[:, 0]] for each in changed])
         scores = agreement.scores(own, T_j_i)
         comparison = Comparison.of(scores[0], scores[1:])
-        by_doppler = _log_ratios(recording, k, turns[:, :3, :3])
+        by_doppler = _log_ratios(recording.select(np.flatnonzero(rig.of_scan == k)), turns[:, :3, :3])
         evidence_of = comparison.significance**2 / 2 + by_doppler
         both = (comparison.significance > _SURE) & (by_doppler > 1) & (evidence_of > _LOG_RATIO)
-        alone = (
-            (comparison.significance > _SURE_ALONE) & (comparison.gains > _GAIN) & (by_doppler > -_LOG_RATIO)
-        )
+        sure = comparison.significance > _SURE_ALONE
+        alone = sure & (comparison.gains > _GAIN) & (by_doppler > -_LOG_RATIO)
         if not (both | alone).any():
             continue
         best = int(np.argmax(np.where(both | alone, comparison.significance + by_doppler, -np.inf)))
@@ -89,21 +86,14 @@ def misread_radars(recording: Scans) -> Iterator[tuple[Label, Finding]]:
         yield label, Finding(name, "error", evidence)
 
 
-def _log_ratios(recording: Scans, k: int, turns: Floats) -> Floats:
-    """Log likelihood ratios (H - 1,) of mean velocities of radar `k` by Doppler, turned by `turns` (H, 3, 3), to those as they are."""
-    rig, times_s = recording.rig, recording.times_s
-    assert rig is not None
-    rows = np.flatnonzero(rig.of_scan == k)
-    if (
-        recording.doppler_mps is None
-        or times_s is None
-        or len(rows) < 3
-        or (np.diff(times_s[rows]) <= 0).any()
-    ):
+def _log_ratios(recording: Scans, turns: Floats) -> Floats:
+    """Log likelihood ratios (H - 1,) of mean velocities of a radar by Doppler, turned by `turns` (H, 3, 3), to those as they are."""
+    times_s = ascending_times_s(recording)
+    if recording.doppler_mps is None or times_s is None or len(recording) < 3:
         return np.zeros(len(turns) - 1)
-    found = sensor_velocities([recording.points[i] for i in rows], [recording.doppler_mps[i] for i in rows])
-    by_poses = velocity_of_poses(recording.sensor_poses[rows], times_s[rows])
-    by_doppler = np.array([velocity.velocity_mps for velocity in found])
+    scans, found = velocities_of_some(recording, recording.doppler_mps)
+    by_poses = velocity_of_poses(recording.sensor_poses, times_s)[scans]
+    by_doppler = np.reshape([velocity.velocity_mps for velocity in found], (-1, 3))
     speed = np.linalg.norm(by_poses, axis=1).mean()
     if not np.isfinite(by_doppler).any() or speed == 0:
         return np.zeros(len(turns) - 1)

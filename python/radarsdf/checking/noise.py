@@ -53,10 +53,7 @@ def check_ground(recording: Scans) -> Iterator[Finding]:
     ground = float(edges[np.argmax(counts)]) + _BIN_M / 2
     share = float((height < ground - _DEPTH_M - _DEPTH_PER_M * distance).mean())
     if share >= _SOME:
-        evidence = (
-            f"{share:.1%} of the returns closer than {_CLOSE_M:g} m lie clearly below the ground, which is {-ground:.1f} m below "
-            "the sensor."
-        )
+        evidence = f"{share:.1%} of returns within {_CLOSE_M:g} m are clearly below the ground, {-ground:.1f} m below the sensor."
         yield Finding("below_ground", "warning" if share > _MANY else "note", evidence)
 
 

@@ -9,17 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from radarsdf import checks
 from radarsdf.arrays import Array, Floats
-from radarsdf.checks import (
-    MAX_TIME_S,
-    check,
-    check_scan_shapes,
-    check_values_of_scans,
-    one_for_each_scan,
-    pose_matrices,
-    real_array,
-    refuse_masked,
-)
 from radarsdf.scans import Scans
 
 Severity = Literal["error", "warning", "note"]
@@ -104,7 +95,6 @@ class Finding:
     """Remedy in one or two sentences. Default: that of the name."""
 
     def __post_init__(self) -> None:
-        """Look up the remedy."""
         object.__setattr__(self, "fix", self.fix or FIXES[self.name])
 
     def __str__(self) -> str:
@@ -122,13 +112,14 @@ def checked_input(
 
     Raises a TypeError or a ValueError that names the argument.
     """
-    scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
-    check_scan_shapes(scans)
-    T_world_sensor = pose_matrices(poses, len(scans))
-    times = None if times_s is None else real_array(times_s, "times_s").copy()
+    scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(checks.one_for_each_scan(points, "points"))]
+    checks.check_scan_shapes(scans)
+    T_world_sensor = checks.pose_matrices(poses, len(scans))
+    times = None if times_s is None else checks.real_array(times_s, "times_s").copy()
     if times is not None:
-        check(times.shape == (len(scans),), f"times_s must have shape ({len(scans)},), not {times.shape}")
-        times[np.abs(times) > MAX_TIME_S] = np.nan
+        one_each = times.shape == (len(scans),)
+        checks.check(one_each, f"times_s must have shape ({len(scans)},), not {times.shape}")
+        times[np.abs(times) > checks.MAX_TIME_S] = np.nan
     doppler = _values(doppler_mps, scans, "doppler_mps")
     values = _values(intensities, scans, "intensities")
     return Scans(scans, T_world_sensor, values, doppler_mps=doppler, times_s=times)
@@ -153,15 +144,15 @@ def some_points(scans: Scans) -> list[Floats]:
 def _numbers(values: ArrayLike, name: str) -> Array:
     """Convert to an array of real numbers. float32 is kept: only samples enter computations."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f":
-        refuse_masked(values, name)
+        checks.refuse_masked(values, name)
         return values
-    return real_array(values, name)
+    return checks.real_array(values, name)
 
 
 def _values(given: Sequence[ArrayLike] | None, scans: list[Array], name: str) -> list[Array] | None:
     if given is None:
         return None
-    each = enumerate(one_for_each_scan(given, name))
+    each = enumerate(checks.one_for_each_scan(given, name))
     values = [_numbers(value, f"{name} of scan {i}") for i, value in each]
-    check_values_of_scans(values, scans, name)
+    checks.check_values_of_scans(values, scans, name)
     return values

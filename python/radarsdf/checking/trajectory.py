@@ -71,14 +71,12 @@ def check_lengths(recording: Scans) -> Iterator[Finding]:
 
 
 def check_times(recording: Scans) -> Iterator[Finding]:
-    """Check that the times are plausible for the scans."""
     times = recording.times_s
     if times is None or len(times) < 2 or ascending_times_s(recording) is not None:
         return
     wrong = int((~(np.diff(times) > 0)).sum())
-    evidence = (
-        f"{wrong} of {len(times) - 1} times are not later than the one before, or not finite: none is used."
-    )
+    late = f"{wrong} of {len(times) - 1} times are not later than the one before"
+    evidence = f"{late}, or not finite: none is used."
     yield Finding("times", "warning", evidence)
 
 
@@ -95,9 +93,8 @@ def check_duplicates(recording: Scans, numbers: Ints) -> Iterator[Finding]:
             repeated.append((same, i))
     if repeated:
         first, copy = numbers[list(repeated[0])]
-        evidence = (
-            f"{len(repeated)} of {len(recording)} scans are copies, such as scan {copy} of scan {first}."
-        )
+        count = f"{len(repeated)} of {len(recording)}"
+        evidence = f"{count} scans are copies, such as scan {copy} of scan {first}."
         yield Finding("duplicate_scans", "warning", evidence)
     same_pose = (recording.poses[1:] == recording.poses[:-1]).all(axis=(1, 2))
     same_pose[[later - 1 for earlier, later in repeated if later == earlier + 1]] = False
@@ -134,11 +131,8 @@ def check_jumps(recording: Scans, numbers: Ints, effort: Effort = FULL) -> Itera
     usual = float(np.median(changes))
     least = _JUMP * max(usual, 0.1 * float(np.median(np.linalg.norm(vectors, axis=1))))
     agreement = Agreement(recording.points, effort.returns, 2 * effort.queries)
-    suspects = [
-        k
-        for k in np.flatnonzero(changes > least).tolist()
-        if changes[k] * durations[k] > _LEAST_JUMP * agreement.spacing_m(k)
-    ]
+    jumps = np.flatnonzero(changes > least).tolist()
+    suspects = [k for k in jumps if changes[k] * durations[k] > _LEAST_JUMP * agreement.spacing_m(k)]
     suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
     confirmed = [k for k in suspects if _agree_without(recording, agreement, k, suspects, moved, durations)]
     if confirmed:

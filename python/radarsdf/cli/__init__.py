@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from radarsdf.cli.commands import overview
+from radarsdf.cli.options import overview
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -5,16 +5,10 @@ from __future__ import annotations
 import io
 import os
 import sys
-from argparse import Namespace
-from collections.abc import Callable
 from importlib import import_module
-from typing import TypeAlias
 
-from radarsdf.cli.commands import COMMANDS, TILE_STEPS, steps
-from radarsdf.cli.options import Parser, UsageError, refuse_if
+from radarsdf.cli.options import COMMANDS, TILE_STEPS, Parser, UsageError, refuse_if, steps
 from radarsdf.cli.results import Results, warn
-
-_Function: TypeAlias = Callable[[Namespace, Results], int | None]
 
 # Errors with a message for the user. Every other error is a bug and keeps its traceback.
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
@@ -72,17 +66,12 @@ def _run(words: list[str]) -> int:
     given = Parser(command, usage, text).parse_args(words)
 
     results = Results(**{key: vars(given).get(key, False) for key in ("quiet", "json")})
-    status = _function_of(command)(given, results)
-    results.end()
-    return int(status or 0)
-
-
-def _function_of(command: str) -> _Function:
-    """Import the function of a command. Each imports only what it needs, which may take long."""
+    # Each module imports only what it needs, which may take long.
     name, _, step = command.partition(" ")
     module = import_module(f"radarsdf.cli.{_MODULES.get(name, name)}")
-    found: _Function = getattr(module, step or ("evaluate" if name == "eval" else name))
-    return found
+    status = getattr(module, step or ("evaluate" if name == "eval" else name))(given, results)
+    results.end()
+    return int(status or 0)
 
 
 def message_of(error: Exception) -> str:

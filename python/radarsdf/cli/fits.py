@@ -75,11 +75,9 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
     report = radar_map.report
     names = ("scans", "returns", "returns_used", "moving", "ghosts", "intensity_outliers", "leaf_cells")
     scans, returns, used, moving, ghosts, outliers, _ = (report[name] for name in names)
-    left_out = {
-        "move according to their Doppler": moving,
-        "are ghosts": ghosts,
-        "are invalid or out of range": returns - used - moving - ghosts,
-    }
+    invalid = returns - used - moving - ghosts
+    left_out = {"move according to their Doppler": moving, "are ghosts": ghosts}
+    left_out["are invalid or out of range"] = invalid
     line = f"{used} of {returns} returns in {scans} scans form the surface"
     line += "".join(f", {count} {why}" for why, count in left_out.items() if count)
     results.add(line, **{name: report[name] for name in names})
@@ -89,12 +87,8 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
     seconds = sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s")
     loss = "".join(f", {stage} loss {value:.3g}" for stage, value in losses.items())
     results.add(f"fit {seconds:.1f} s: {radar_map}{loss}", seconds=seconds, losses=losses)
-    results.add(
-        f"noise {noise['range_m']:.3f} m, azimuth {noise['azimuth_rad']:.4f} rad, "
-        f"elevation {noise['elevation_rad']:.4f} rad",
-        noise=noise,
-        map_bytes=radar_map.file_bytes,
-    )
+    angles = ", ".join(f"{axis} {noise[f'{axis}_rad']:.4f} rad" for axis in ("azimuth", "elevation"))
+    results.add(f"noise {noise['range_m']:.3f} m, {angles}", noise=noise, map_bytes=radar_map.file_bytes)
 
 
 def demo(given: Namespace, results: Results) -> None:

@@ -41,19 +41,18 @@ def read_scans(given: Namespace, poses: StampedPoses | None = None) -> Scans:
     for role, _, name in fields:
         refuse_if(not (role and name), f"--field takes ROLE=NAME, not {role!r:.50}")
     columns = given.columns
+    names = ("topic", "pose_topic", "imu_topic", "world_frame", "stamps")
+    extrinsic = given.extrinsic and read_numbers(given.extrinsic, 4)
+    rotation = given.imu_rotation and read_numbers(given.imu_rotation, 3)
     return read(
         given.scans,
         given.poses if poses is None else poses,
-        extrinsic=None if given.extrinsic is None else read_numbers(given.extrinsic, 4),
-        topic=given.topic,
-        pose_topic=given.pose_topic,
-        imu_topic=given.imu_topic,
-        R_sensor_imu=None if given.imu_rotation is None else read_numbers(given.imu_rotation, 3),
+        extrinsic=extrinsic,
+        R_sensor_imu=rotation,
         fields={role: name for role, _, name in fields} or None,
         columns=int(columns) if columns and columns.isdecimal() else columns and columns.split(","),
-        world_frame=given.world_frame,
-        stamps=given.stamps,
         max_gap_s=given.max_gap,
+        **{name: getattr(given, name) for name in names},
     )
 
 
@@ -76,7 +75,6 @@ def scans_if(wanted: object, given: Namespace) -> Scans | None:
 
 
 def without_intensities(scans: Scans) -> Scans:
-    """Leave out the intensities."""
     without = partial(dataclasses.replace, intensities=None)
     return Scans.of_source(lambda: map(without, scans), Notes(), mountings=lambda: scans.T_body_sensor)
 
@@ -96,7 +94,6 @@ def inputs_of(given: Namespace) -> list[Path]:
 
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:
-    """Limits of the mesh, as arguments of ``Map.mesh``."""
     return {name: getattr(given, name) for name in LIMITS}
 
 

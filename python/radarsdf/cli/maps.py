@@ -95,10 +95,8 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
     results.add("held-out " + format_metrics(errors), held_out=errors)
     knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)
-    results.add(
-        f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours",
-        knn=metrics | {"neighbours": knn.k, "candidates": knn.candidates},
-    )
+    line = f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours"
+    results.add(line, knn=metrics | {"neighbours": knn.k, "candidates": knn.candidates})
 
 
 def render(given: Namespace, results: Results) -> None:

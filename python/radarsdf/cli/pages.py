@@ -22,16 +22,9 @@ def view(given: Namespace, results: Results) -> None:
     """Serve the page until Ctrl-C, after printing its address."""
     check_address(given)
     radar_map = load_map(given.map)
-    with Viewer(
-        radar_map,
-        scans_if(given.scans, given),
-        voxel_size=given.voxel,
-        box=given.box,
-        host=given.host,
-        port=given.port,
-        progress=results.progress,
-        **mesh_limits(given),
-    ) as viewer:
+    scans, options = scans_if(given.scans, given), {"box": given.box, "progress": results.progress}
+    page = {"voxel_size": given.voxel, "host": given.host, "port": given.port}
+    with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer:
         url = serving.url_of(viewer.host, viewer.port)
         print(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it", flush=True)
         if serving.has_display() if given.open is None else given.open:
@@ -52,21 +45,12 @@ def report(given: Namespace, results: Results) -> None:
     if every_scan is not None:
         findings = check(every_scan, config=radar_map.config)
         scans, held_out = split(every_scan, given.holdout)
-    subject = Subject(
-        radar_map,
-        given.map.absolute().name,
-        scans,
-        held_out,
-        findings,
-        voxel_size_m=given.voxel,
-        box=given.box,
-        progress=results.progress,
-        limits=mesh_limits(given),
-    )
+    options = {"voxel_size_m": given.voxel, "box": given.box, "limits": mesh_limits(given)}
+    name = given.map.absolute().name
+    subject = Subject(radar_map, name, scans, held_out, findings, progress=results.progress, **options)
     add_report(results, given.out, subject)
 
 
 def add_report(results: Results, path: Path, subject: Subject) -> None:
-    """Write a page about a map."""
     size = write_report(path, subject)
     results.add(f"report of {size / 1e6:.1f} MB written to {path}", report=path, report_bytes=size)

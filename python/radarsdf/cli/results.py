@@ -30,7 +30,6 @@ class Results:
         self._values |= values
 
     def table(self, rows: Iterable[Sequence[str]]) -> None:
-        """Print aligned rows for people."""
         rows = list(rows)
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         for row in rows:
@@ -38,13 +37,11 @@ class Results:
             self.add("  ".join(cells).rstrip())
 
     def add_mesh(self, path: Path, vertices: int, triangles: int, threshold: Threshold) -> None:
-        """Add a written mesh, its confidence threshold and the expected effect of that."""
         line = f"{vertices} vertices and {triangles} triangles"
         self.add_file(line, path, vertices=vertices, triangles=triangles)
         self.add(str(threshold), **vars(threshold))
 
     def add_file(self, what: str, path: Path, **values: Any) -> None:
-        """Add a line on a written file."""
         self.add(f"{what} written to {path}", out=path, **values)
 
     def end(self) -> None:

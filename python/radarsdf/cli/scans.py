@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from argparse import Namespace
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -125,32 +126,19 @@ def calibrate(given: Namespace, results: Results) -> None:
     found = radarsdf.calibrate(scans_or_unposed(given)[0], config=load_config(given))
     for note in found.notes:
         warn(f"note: {note}")
-    results.add(
-        f"mountings relative to that of {found.against}; deviations in brackets", against=found.against
-    )
+    results.add(f"mountings relative to {found.against}; deviations in brackets", against=found.against)
     of_imu = {} if found.imu is None else {"IMU": found.imu}
     mountings = {str(label): mounting for label, mounting in found.mountings.items()} | of_imu
     rows = [["radar", "x, y, z, m", "yaw, pitch, roll, degrees", "time offset, ms"]]
     for label, one in mountings.items():
         sigmas = np.sqrt(one.covariance.diagonal())
         R = one.T_body_sensor[:3, :3]
-        angles = (
-            Rotation.from_matrix(R).as_euler("ZYX", degrees=True)
-            if np.isfinite(R).all()
-            else np.full(3, np.nan)
-        )
-        parts = (
-            (one.T_body_sensor[:3, 3], sigmas[:3], 3),
-            (angles, np.degrees(sigmas[:2:-1]), 2),
-            ([1e3 * one.time_offset_s], [1e3 * one.time_offset_sigma_s], 1),
-        )
-        cells = [
-            " ".join(
-                f"{value:.{digits}f} ({sigma:.{digits}f})"
-                for value, sigma in zip(values, deviations, strict=True)
-            )
-            for values, deviations, digits in parts
-        ]
+        angles = np.full(3, np.nan)
+        if np.isfinite(R).all():
+            angles = Rotation.from_matrix(R).as_euler("ZYX", degrees=True)
+        cells = [_with_deviations(one.T_body_sensor[:3, 3], sigmas[:3], 3)]
+        cells += [_with_deviations(angles, np.degrees(sigmas[:2:-1]), 2)]
+        cells += [_with_deviations([1e3 * one.time_offset_s], [1e3 * one.time_offset_sigma_s], 1)]
         rows.append([label, *cells])
     results.table(rows)
     for label, one in mountings.items():
@@ -161,6 +149,11 @@ def calibrate(given: Namespace, results: Results) -> None:
     if given.out is not None:
         write_whole(given.out, f"{json.dumps(plain(values), indent=2)}\n".encode())
         results.add_file(f"{len(values)} mountings", given.out)
+
+
+def _with_deviations(values: Iterable[float], sigmas: Iterable[float], digits: int) -> str:
+    pairs = zip(values, sigmas, strict=True)
+    return " ".join(f"{value:.{digits}f} ({sigma:.{digits}f})" for value, sigma in pairs)
 
 
 def convert(given: Namespace, results: Results) -> None:

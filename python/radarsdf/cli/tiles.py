@@ -24,7 +24,6 @@ _FIRST_SCANS = 100  # checked before the work
 
 
 def run(given: Namespace, results: Results) -> int:
-    """Plan, fit and mesh in one go."""
     voxels_along(load_config(given).leaf_size_m, given.voxel)  # raises before the work
     plan(given, results)
     in_folder = Namespace(**vars(given) | {"folder": given.out, "tile": None, "out": None})
@@ -42,29 +41,21 @@ def plan(given: Namespace, results: Results) -> None:
         first = list(itertools.islice(iter(scans), _FIRST_SCANS))
         if len(first) > 1:
             warn_or_refuse(scans_in_memory(first))
-    planned = plan_tiles(
-        without_intensities(scans) if given.geometry_only else scans,
-        given.out,
-        tile_size=given.tile_size,
-        halo=given.halo,
-        config=config,
-        threads=1 if given.processes or given.cluster else None,
-    )
+    threads = 1 if given.processes or given.cluster else None
+    scans = without_intensities(scans) if given.geometry_only else scans
+    options = {"tile_size": given.tile_size, "halo": given.halo, "config": config, "threads": threads}
+    planned = plan_tiles(scans, given.out, **options)
     names = ("returns", "rays", "seconds")
     totals = {name: sum(getattr(tile, name) for tile in planned.tiles) for name in names}
     most = max(tile.memory_bytes for tile in planned.tiles)
-    results.add(
+    line = (
         f"{len(planned.tiles)} tiles of {planned.tile_m:g} m with a halo of {planned.halo_m:g} m, "
         f"{totals['returns']} returns in {planned.scans} scans; about {totals['seconds']:.0f} s in all, and "
-        f"{most / 1e9:.2f} GB for the largest",
-        tiles=len(planned.tiles),
-        tile_m=planned.tile_m,
-        halo_m=planned.halo_m,
-        scans=planned.scans,
-        memory_bytes=most,
-        plan=given.out / "plan.json",
-        **totals,
+        f"{most / 1e9:.2f} GB for the largest"
     )
+    totals |= {name: getattr(planned, name) for name in ("tile_m", "halo_m", "scans")}
+    plan_file = given.out / "plan.json"
+    results.add(line, tiles=len(planned.tiles), memory_bytes=most, plan=plan_file, **totals)
 
 
 def _check_where(given: Namespace) -> None:
@@ -93,7 +84,6 @@ def fit(given: Namespace, results: Results) -> int:
 
 
 def mesh(given: Namespace, results: Results) -> None:
-    """Write the surface of all tiles as one mesh."""
     out, limits = given.out or given.folder / "mesh.ply", mesh_limits(given)
     check_outputs([out])
     city = TiledMap(given.folder)
@@ -102,7 +92,6 @@ def mesh(given: Namespace, results: Results) -> None:
 
 
 def status(given: Namespace, results: Results) -> int:
-    """List the unfinished tiles with the reasons."""
     plan = Plan.load(given.folder)
     tiles = [tile for tile in plan.tiles if given.tile is None or tile.name in given.tile]
     undone = [tile for tile in tiles if not is_done(given.folder, plan, tile)]

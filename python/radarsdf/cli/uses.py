@@ -13,8 +13,8 @@ from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.meshes import MESH_SUFFIXES
 from radarsdf.render.figures import save_grid_picture
-from radarsdf.report.changes import write_changes_report
 from radarsdf.report.page import require_extras
+from radarsdf.report.writing import write_changes_report
 from radarsdf.view.pages import ChangesView
 from radarsdf.view.serving import url_of
 
@@ -39,11 +39,8 @@ def compare(given: Namespace, results: Results) -> None:
     results.add(found["alignment"], alignment=found["alignment"], T_before_after=changes.T_before_after)
     results.add(found["reflectance"], reflectance=found["reflectance"])
     areas = ", ".join(f"{name} {area:.1f}" for name, area in found["areas_m2"].items())
-    results.add(
-        f"of {found['compared_m2']:.0f} m2 that both observed, m2: {areas}",
-        areas_m2=found["areas_m2"],
-        compared_m2=found["compared_m2"],
-    )
+    areas_m2 = {name: found[name] for name in ("areas_m2", "compared_m2")}
+    results.add(f"of {found['compared_m2']:.0f} m2 that both observed, m2: {areas}", **areas_m2)
     regions = changes.regions(given.min_area)
     results.add(regions=[vars(region) for region in regions])
     rows = [["region", "m2", "x, m", "y, m", "z, m", "probability"]]
@@ -94,12 +91,7 @@ def grid(given: Namespace, results: Results) -> None:
     shares = {name: float(getattr(found, name).mean()) for name in ("occupied", "free", "unknown")}
     size = " x ".join(map(str, found.shape))
     origin = " ".join(f"{coordinate:.2f}" for coordinate in found.origin)
-    results.add(
-        f"{size} voxels of {found.voxel_size:g} m from {origin}: "
-        + ", ".join(f"{100 * share:.1f} % {name}" for name, share in shares.items()),
-        shape=found.shape,
-        origin=found.origin,
-        voxel_size=found.voxel_size,
-        **shares,
-    )
+    words = ", ".join(f"{100 * share:.1f} % {name}" for name, share in shares.items())
+    values = {"shape": found.shape, "origin": found.origin, "voxel_size": found.voxel_size}
+    results.add(f"{size} voxels of {found.voxel_size:g} m from {origin}: {words}", **values, **shares)
     results.add(f"wrote {', '.join(map(str, outputs))}", out=outputs)

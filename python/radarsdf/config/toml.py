@@ -6,10 +6,10 @@ import dataclasses
 import json
 import sys
 import textwrap
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from radarsdf.checks import AnyPath
 from radarsdf.config.fit_config import FitConfig
 
 if sys.version_info >= (3, 11):
@@ -20,7 +20,7 @@ else:
 _WIDTH = 100  # columns of a comment
 
 
-def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
+def read_toml(path: AnyPath) -> dict[str, Any]:
     """Read settings from a TOML file, as :meth:`FitConfig.override` takes them. A ValueError: the file is not TOML."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))

@@ -47,12 +47,8 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
     check(fits, f"predicted {p.shape} and measured {m.shape} must both be (N,), with at least one return")
     error = np.abs(p - m)
     check(np.isfinite(error).all(), "predicted and measured must be finite")
-    return {
-        "protocol": INTENSITY_PROTOCOL,
-        "mae": float(error.mean()),
-        "medae": float(np.median(error)),
-        "num_returns": p.size,
-    }
+    errors = {"mae": float(error.mean()), "medae": float(np.median(error))}
+    return {"protocol": INTENSITY_PROTOCOL, **errors, "num_returns": p.size}
 
 
 def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:

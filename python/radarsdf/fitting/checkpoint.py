@@ -6,14 +6,13 @@ import hashlib
 import json
 import time
 import warnings
-from os import PathLike
 from typing import Any
 
 from safetensors import SafetensorError
 from torch import Tensor
 
 from radarsdf import _core
-from radarsdf.checks import check, path_of
+from radarsdf.checks import AnyPath, check, path_of
 from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
@@ -34,15 +33,10 @@ class Checkpoint:
     cannot be read, or its folder does not exist.
     """
 
-    def __init__(
-        self, path: str | PathLike[str], rays: Rays, scale: IntensityScale | None, config: FitConfig
-    ) -> None:
+    def __init__(self, path: AnyPath, rays: Rays, scale: IntensityScale | None, config: FitConfig) -> None:
         self._path = path_of(path, "checkpoint")
-        identity = {
-            "version": _core.__version__,
-            "scans": _digest(rays, scale),
-            "config": settings_of_results(config),
-        }
+        identity: dict[str, Any] = {"version": _core.__version__, "scans": _digest(rays, scale)}
+        identity["config"] = settings_of_results(config)
         self._identity: dict[str, Any] = json.loads(json.dumps(identity))
         self._next_s = time.monotonic() + _EVERY_S
         if self._path.exists():

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from os import PathLike
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import MISSING_POSES, instance, pose_matrices
+from radarsdf.checks import AnyPath, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.map.radar_map import RadarMap
@@ -15,7 +14,7 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.moving import StaticReturns
 from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import prepare
-from radarsdf.scans import Scans, filled, rig_of
+from radarsdf.scans import Scans, filled
 from radarsdf.threads import resolve_num_threads
 
 
@@ -27,7 +26,7 @@ def fit(
     doppler_mps: Sequence[ArrayLike] | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
-    checkpoint: str | PathLike[str] | None = None,
+    checkpoint: AnyPath | None = None,
     origin: ArrayLike | None = None,
     intensity_range: tuple[float, float] | None = None,
 ) -> RadarMap:
@@ -97,10 +96,7 @@ def fit(
 
     def read() -> FitInput:
         others = {"poses": poses, "intensities": intensities, "doppler_mps": doppler_mps}
-        scans, poses_, intensities_, doppler_mps_ = filled(points, **others)
-        if poses_ is None:
-            raise ValueError(MISSING_POSES)
-        rig = rig_of(points)
+        rig, scans, poses_, intensities_, doppler_mps_ = filled(points, **others)
         if rig is not None:
             poses_ = rig.sensor_poses(pose_matrices(poses_, len(rig.of_scan)))
         static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns, rig)

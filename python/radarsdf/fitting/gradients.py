@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 from torch.nn import functional
 
 from radarsdf import _core
@@ -78,15 +78,10 @@ class GradientBackend(ABC):
     """
 
     def __init__(
-        self,
-        field: NeuralField,
-        config: FitConfig,
-        dropout_scale: float,
-        generator: torch.Generator,
-        pool: ThreadPool,
+        self, field: NeuralField, config: FitConfig, dropout: float, generator: Generator, pool: ThreadPool
     ) -> None:
         self._field, self._config, self._pool = field, config, pool
-        self._dropout_scale, self._generator = dropout_scale, generator
+        self._dropout_scale, self._generator = dropout, generator
         self._moves_rows = config.moves_rows(field.intensity_network is not None)
 
     @abstractmethod
@@ -114,8 +109,6 @@ class GradientBackend(ABC):
 
 
 class CoreGradients(GradientBackend):
-    """Losses and gradients by the core's ``FieldLoss``, which validates the field's arrays once and reads them in each call."""
-
     def __init__(self, field: NeuralField, config: FitConfig, *others: Any) -> None:
         super().__init__(field, config, *others)
         network, networks = field.intensity_network, config.networks
@@ -228,11 +221,9 @@ class AutogradGradients(GradientBackend):
         labels = samples.intensities[:count].clone()
         labels[samples.num_labelled :] = 0  # free space returns nothing (3QFPI)
         assert self._field.intensity_network is not None
-        predicted: Tensor = self._field.intensity_network(
-            geometry.first(count, factors),
-            samples.directions[:count],
-            samples.ranges_m[:count] - samples.sdf_m[:count],
-        )
+        ranges_m = samples.ranges_m[:count] - samples.sdf_m[:count]
+        encoded = geometry.first(count, factors)
+        predicted: Tensor = self._field.intensity_network(encoded, samples.directions[:count], ranges_m)
         if count == 0:
             return predicted.sum()
         # Weight of this mean in that of the whole batch.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -60,21 +61,11 @@ class Adam(Optimiser):
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:  # noqa: ARG002
         self._step.add_(1)
-        torch._fused_adam_(  # the kernel has no public name
-            self.parameters,
-            list(gradients),
-            self._means,
-            self._squares,
-            [],
-            [self._step] * len(self.parameters),
-            lr=self.learning_rate,
-            beta1=_BETAS[0],
-            beta2=_BETAS[1],
-            weight_decay=0.0,
-            eps=_EPSILON,
-            amsgrad=False,
-            maximize=False,
-        )
+        steps, (beta1, beta2) = [self._step] * len(self.parameters), _BETAS
+        of_each = self.parameters, list(gradients), self._means, self._squares, list[Tensor](), steps
+        rates = {"lr": self.learning_rate, "beta1": beta1, "beta2": beta2, "eps": _EPSILON}
+        step: Any = torch._fused_adam_  # the kernel has no public name
+        step(*of_each, **rates, weight_decay=0.0, amsgrad=False, maximize=False)
 
 
 class Soap(Optimiser):
@@ -165,16 +156,10 @@ class RowAdam:
             decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
             # Denormal numbers would be slow, and are negligible compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
+        of_batch = touched.points, touched.located, touched.gradient
+        rates = self.step_count, self.learning_rate, _EPSILON
         self._cells.table.begin_adam_step(
-            touched.points,
-            touched.located,
-            touched.gradient,
-            *self._arrays,
-            self._decays.numpy(),
-            self.step_count,
-            self.learning_rate,
-            _EPSILON,
-            pool.core_threads,
+            *of_batch, *self._arrays, self._decays.numpy(), *rates, pool.core_threads
         )
         try:
             meanwhile()

@@ -74,7 +74,10 @@ class Schedule:
         if intensity_iterations is None:
             joint_iterations = min(iterations, max(1, round(config.effort * _MOST_JOINT_ITERATIONS)))
             intensity_batch_size = min(intensity_batch_size, samples)
-            intensity_iterations = _intensity_iterations(config, samples, joint_iterations)
+            wanted = math.ceil(_INTENSITY_PASSES * samples / training.intensity_batch_size)
+            wanted = min(max(wanted, _LEAST_INTENSITY_ITERATIONS), _MOST_INTENSITY_ITERATIONS)
+            alone = max(wanted - joint_iterations, _LEAST_INTENSITY_STAGE)
+            intensity_iterations = max(1, joint_iterations + round(config.effort * alone))
         if training.intensity_in_free_space:  # the samples are those of the sdf stage
             intensity_batch_size = batch_size
         # A frequently used sample is easily memorised. Measured: constant dropout for all scenes (0.7 and 0.2)
@@ -100,10 +103,3 @@ def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, 
     if iterations <= _MOST_SDF_ITERATIONS:
         return batch_size, iterations
     return math.ceil(batch_size * iterations / _MOST_SDF_ITERATIONS), _MOST_SDF_ITERATIONS
-
-
-def _intensity_iterations(config: FitConfig, samples: int, joint: int) -> int:
-    """Return the iterations that train the intensity network, the `joint` ones of the sdf stage included."""
-    wanted = math.ceil(_INTENSITY_PASSES * samples / config.training.intensity_batch_size)
-    wanted = min(max(wanted, _LEAST_INTENSITY_ITERATIONS), _MOST_INTENSITY_ITERATIONS)
-    return max(1, joint + round(config.effort * max(wanted - joint, _LEAST_INTENSITY_STAGE)))

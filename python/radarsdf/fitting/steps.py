@@ -6,25 +6,26 @@ import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Bools, Ints, Keys
+from radarsdf._core import cell_keys, stable_order
+from radarsdf.arrays import Bools, Floats32, Ints, Keys
+from radarsdf.checks import AnyPath
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.average import average_surface
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.closed_form import closed_form
 from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
-from radarsdf.fitting.occupied_cells import occupied_cells
 from radarsdf.fitting.schedule import Schedule
-from radarsdf.fitting.surface_returns import SurfaceReturns
+from radarsdf.fitting.surface_returns import SurfaceReturns, occupied_cells
 from radarsdf.fitting.train import Diverged, Interrupted, Training
 from radarsdf.map.contents import Deferred, MapContents
+from radarsdf.map.queries import evaluate
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
 from radarsdf.returns.free_space import FreeSpace
@@ -32,12 +33,17 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import ScanSums
 from radarsdf.returns.view_statistics import ViewStatistics
 from radarsdf.threads import ThreadPool
 
 _Stop = KeyboardInterrupt | Diverged | None
+# Of more returns than both of these, closed-form intensities use an even sample. Measured on a street of 10⁷ returns: every
+# second has an error larger by 0.1 % of the noise in half the time, every fourth 0.3 %, every seventh 0.4 %; on `facade`
+# (500,000 returns) every second 1.4 % of the error.
+_ENOUGH_RETURNS, _ENOUGH_PER_PLANE = 200_000, 16
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,7 @@ def fit_rays(
     config: FitConfig,
     *,
     progress: bool | None = None,
-    checkpoint: str | PathLike[str] | None = None,
+    checkpoint: AnyPath | None = None,
 ) -> RadarMap:
     """Fit a map to the input that `read` returns. See :func:`radarsdf.fit`, also for errors."""
     try:
@@ -98,7 +104,7 @@ class _Begun:
 class _Fit:
     config: FitConfig
     progress: bool | None
-    checkpoint: str | PathLike[str] | None
+    checkpoint: AnyPath | None
     pool: ThreadPool
     seconds: dict[str, float]  # wall-clock time of each step
     _ends_s: list[float] = dataclasses.field(default_factory=lambda: [time.perf_counter()])
@@ -163,12 +169,9 @@ class _Fit:
         sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
         schedule = Schedule.of(config, with_intensity=with_network, **sizes)
         closes = learnt.intensities is not None and config.closes_intensity
-        begun = _Begun(
-            field=field,
-            contents=_contents(given, learnt, surface, leaf_keys, returns, config, num_threads),
-            report=_report(given, learnt, surface, field, schedule, config),
-            intensities=(learnt, surface.surfels) if closes else None,
-        )
+        contents = _contents(given, learnt, surface, leaf_keys, returns, config, num_threads)
+        report = _report(given, learnt, surface, field, schedule, config)
+        begun = _Begun(field, contents, report, (learnt, surface.surfels) if closes else None)
         training = None
         if isinstance(field, NeuralField):
             scale = given.scale if config.trains_intensity else None
@@ -222,25 +225,20 @@ def _contents(
 
 
 def _report(
-    given: FitInput,
-    learnt: Rays,
-    surface: SurfaceReturns,
-    field: Field,
-    schedule: Schedule,
-    config: FitConfig,
+    given: FitInput, rays: Rays, surface: SurfaceReturns, field: Field, schedule: Schedule, config: FitConfig
 ) -> dict[str, Any]:
     cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
-    sizes = {"returns": len(learnt), "cells": cells, "rows": rows}
+    sizes = {"returns": len(rays), "cells": cells, "rows": rows}
     skipped: list[tuple[str, float | None]] = []
     if given.why_none_moving is not None:
         skipped.append((f"leaving out what moves: {given.why_none_moving}", None))
     skipped += skipped_parts(config, schedule, with_intensity=with_intensity, **sizes)
-    outliers = 0 if learnt.intensities is None else len(learnt) - int(learnt.with_intensity.sum())
+    outliers = 0 if rays.intensities is None else len(rays) - int(rays.with_intensity.sum())
     return {
         "scans": len(given.rays.up_of_scan),
         "returns": given.rays.num_given + given.moving,
         "returns_used": surface.count,
-        "ghosts": len(learnt) - surface.count,
+        "ghosts": len(rays) - surface.count,
         "moving": given.moving,
         "intensity_outliers": outliers,
         "noise": dataclasses.asdict(surface.noise.mean),
@@ -254,3 +252,40 @@ def _report(
         "losses": {},
         "loss_history": {},
     }
+
+
+def closed_form(
+    field: Field,
+    rays: Rays,
+    surfels: Surfels,
+    scale: IntensityScale,
+    config: FitConfig,
+    range_limits_m: tuple[float, float],
+    num_threads: int,
+) -> Reflectance:
+    """Fit intensities of `rays`, ghosts included, in closed form, or the residuals of the network of `field`.
+
+    `range_limits_m`: ranges to which queries of the map are clipped.
+    """
+    known = rays.with_intensity
+    if known.any() and not known.all():  # a tile without any counts as the middle of the range
+        rays = rays.select(known)
+    rays = _in_order(rays, surfels, num_threads)
+    assert rays.intensities is not None
+
+    def network(points: Floats32, directions: Floats32, ranges_m: Floats32) -> Floats32:
+        columns = np.column_stack([points, directions, np.clip(ranges_m, *range_limits_m)])
+        return evaluate(lambda x: field.intensity(x[:, :3], x[:, 3:6], x[:, 6]), columns).clip(0, 1)
+
+    unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
+    ask = network if config.trains_intensity else None
+    return Reflectance.of(rays, unit, surfels, config.leaf_size_m, ask, num_threads)
+
+
+def _in_order(rays: Rays, surfels: Surfels, num_threads: int) -> Rays:
+    """Sort rays by place, independent of the order of scans. Of very many, select every n-th: evenly among places."""
+    enough = max(_ENOUGH_RETURNS, _ENOUGH_PER_PLANE * int(surfels.is_flat().sum()))
+    every = -(-len(rays) // enough)
+    # The lower half of the Morton keys, which repeats after 400 m or more, and pseudo-random numbers within each cell.
+    keys = cell_keys(np.ascontiguousarray(rays.points), surfels.cell_size_m, num_threads) << np.uint64(33)
+    return rays.select(stable_order(keys | rays.hashes() >> np.uint64(31))[::every])

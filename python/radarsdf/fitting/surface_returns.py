@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from radarsdf.arrays import Bools, Ints32
+from radarsdf._core import CellSet
+from radarsdf.arrays import Bools, Ints32, Keys
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.fitting.average import BAND_CELLS
+from radarsdf.fitting.sampling import NEAR_BAND_CELLS
+from radarsdf.returns.evidence import ReturnsOfCells, bridged
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise, onto_surfels, sensor_noise
 from radarsdf.returns.planes import Surfels
@@ -108,3 +113,27 @@ def _returns_to_average(
         leaves = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
         means = means.select(leaves.blocks.rows(means.keys, num_threads) >= 0)
     return SurfaceReturns(rays, count, surfels, noise, means, true)
+
+
+def occupied_cells(used: SurfaceReturns, config: FitConfig, num_threads: int) -> tuple[Keys, ReturnsOfCells]:
+    """Return the ascending keys (C,) of the leaf cells near returns or bridging gaps, and the returns of cells."""
+    noise, returns = used.noise, config.returns
+    if used.means is None:
+        keys = near_leaf_keys(used.rays, config, num_threads)
+        of_cells = ReturnsOfCells.of_rays(used.rays, noise, config.leaf_size_m, returns, num_threads)
+    else:
+        keys = used.means.leaf_keys(config.leaf_size_m, config.metres(BAND_CELLS), num_threads)
+        of_cells = ReturnsOfCells.of_means(used.means, noise, returns)
+    return bridged(keys, of_cells.keys, of_cells.counts, config.encoding.bridge_cells, num_threads), of_cells
+
+
+def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> Keys:
+    """Return the ascending Morton keys (C,) of the leaf cells that can contain a sample near the surface."""
+    # Points every half cell along the near band of each ray: random samples would make the cells depend on the seed.
+    band_m = config.metres(NEAR_BAND_CELLS)
+    steps = math.ceil(2 * band_m / (config.leaf_size_m / 2))
+    cells = CellSet(config.leaf_size_m)
+    offsets_m = np.linspace(-band_m, band_m, steps + 1).astype(np.float32)
+    points, directions, _ = rays.in_c_order()
+    cells.insert_along(points, directions, offsets_m, num_threads)
+    return cells.sorted_keys(num_threads)

@@ -248,7 +248,6 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
 
 
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
-    """Topics that have messages of these types."""
     return {n: topic for n, topic in topics.items() if topic.message_type in types and topic.num_messages}
 
 
@@ -295,7 +294,6 @@ class Clock(NamedTuple):
         return cls(wanted == "record", delay_s, partial(notes.add, zero))
 
     def times(self, stamps_s: Any, recorded_s: Any) -> Any:
-        """Times, s, of one or several messages."""
         if self.recorded:
             return recorded_s
         zero = np.equal(stamps_s, 0) & np.isfinite(self.delay_s)

@@ -175,7 +175,6 @@ def _held_corrections(slow: Trajectory, below: Trajectory, track: Track, request
 
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
-    """Read the transforms of all frames in bags."""
     topics = topics_with(bag_messages.TRANSFORM_TYPES, bag_messages.topics_of(paths))
     return _tracks_and_tree(paths, set(), set(topics), request)[1]
 

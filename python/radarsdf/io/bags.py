@@ -198,14 +198,12 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     return wanted or next(iter(fitting), None)
 
 
-def _read_imu(
-    paths: list[Path], topic: str, sensor_frame: str, recorded: bool, request: Request
-) -> Imu | None:
+def _read_imu(bags: list[Path], topic: str, radar_frame: str, recorded: bool, request: Request) -> Imu | None:
     """Read the inertial measurements of a topic; None if it has no gyroscope."""
     # If scans are stamped with record times (`recorded`), each measurement is shifted by the median delay from stamp to
     # record, because IMU messages are recorded in batches.
     numbers, frame = array("d"), ""
-    for message in read_messages(paths, {topic}, request.notes):
+    for message in read_messages(bags, {topic}, request.notes):
         rates, force = message.content
         if rates is None:
             request.notes.add(f"{topic} has no angular velocity: it is not used")
@@ -224,6 +222,6 @@ def _read_imu(
     has_force = np.isfinite(forces).all() and forces.any()
     R_sensor_imu = request.R_sensor_imu
     if R_sensor_imu is None and frame:
-        T_imu_sensor = transforms_in(paths, request).fixed(frame, sensor_frame)
+        T_imu_sensor = transforms_in(bags, request).fixed(frame, radar_frame)
         R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
     return Imu(times_s[order], table[order, 2:5], forces if has_force else None, R_sensor_imu)

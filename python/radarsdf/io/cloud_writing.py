@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from os import PathLike
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.arrays import Array
+from radarsdf.checks import AnyPath
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
 from radarsdf.io.fields import SIGMA, columns_of
@@ -23,7 +23,7 @@ _LAS_FORMAT = 6  # the first of LAS 1.4, with a time
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 
-def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
+def write_cloud(path: AnyPath, scans: Scans) -> int:
     """Write all returns of scans as one point cloud, atomically.
 
     The cloud has x, y, z in the world frame, m; intensity in sensor units, doppler in m/s and time, s, if all scans have

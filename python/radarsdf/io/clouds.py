@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Sequence
-from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
@@ -13,11 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats, Floats32
-from radarsdf.checks import check, path_of
+from radarsdf.checks import AnyPath, check, path_of
 from radarsdf.extras import require
 from radarsdf.io.fields import Fields, names_of
 from radarsdf.io.files import check_regular_file, reading
-from radarsdf.io.lzf import unpack_lzf
 from radarsdf.io.npz import array_in
 from radarsdf.io.text import as_numbers, read_table
 from radarsdf.scans import Columns, Notes
@@ -31,6 +29,8 @@ _LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # layers of a chunk by point 
 _VARIABLE = 2**32 - 1  # marks chunks of varying size, in place of the number of points per chunk
 _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a PCD header has eleven lines
 _PCD_TYPES = {f"<{kind}{size}" for kind in "iuf" for size in (1, 2, 4, 8)} - {"<f1"}
+_LITERALS = 32  # a control byte below this precedes that many literal bytes, plus one
+_LONG = 7  # largest length of three bits: the next byte is added to it
 _PLY_HEADER_BYTES = 1 << 16
 _KITTI_WIDTH, _INSPECTED_FILES = 4, 20  # columns, and number of .bin files that are inspected
 _MAX_POSITION_M, _DAMAGED = 1e7, 0.02  # limit of coordinates, and share of numbers that may be damaged
@@ -57,7 +57,7 @@ def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
         raise ValueError(msg) from error
 
 
-def read_points(path: str | PathLike[str]) -> Floats:
+def read_points(path: AnyPath) -> Floats:
     """Read points, such as ground truth from a lidar, from a file of any format that :func:`read` supports.
 
     Parameters
@@ -173,6 +173,27 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
         return {names[i]: np.frombuffer(data, kinds[i], points, points * starts[i]) for i in scalars}
     words = np.array(body.split()).reshape(points, sum(counts))
     return {names[i]: as_numbers(words[:, sum(counts[:i])]) for i in scalars}
+
+
+def unpack_lzf(data: bytes, size: int) -> bytes:
+    """Unpack `size` bytes of LZF, by which PCL compresses. Raises a ValueError if the data are damaged."""
+    out, at = bytearray(), 0
+    end = data + bytes(3)  # padding, for truncated streams
+    while at < len(data) and len(out) <= size:
+        control, at = end[at], at + 1
+        if control < _LITERALS:
+            out += data[at : at + control + 1]
+            at += control + 1
+            continue
+        length, distance = control >> 5, (control & 0x1F) << 8
+        if length == _LONG:
+            length, at = length + end[at], at + 1
+        length, distance, at = length + 2, distance + end[at] + 1, at + 1
+        check(distance <= len(out), "its compressed data are damaged")
+        part = out[len(out) - distance :][:length]  # repeated below if the copy overlaps its own output
+        out += (part * (length // len(part) + 1))[:length]
+    check(len(out) == size and at == len(data), f"its compressed data do not unpack to {size} bytes")
+    return bytes(out)
 
 
 def read_viewpoint(path: Path) -> Floats:

@@ -31,7 +31,6 @@ class Dataset(NamedTuple):
 
 
 def find(folder: Path) -> Dataset | None:
-    """Return the data set with the layout of a folder, or None."""
     return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
 
 

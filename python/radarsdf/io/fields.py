@@ -127,7 +127,6 @@ class Fields:
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes) -> None:
-        """Note intensities in linear units, and unused fields."""
         name = self.names.get("intensity", "")
         if plain_name(name)[1] == "linear":
             notes.add(f"{name} is used as intensity unchanged: in dB, 10 log10, it gives a better map")

@@ -12,14 +12,13 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import check, path_of
+from radarsdf.checks import AnyPath, check, path_of
 
 _MAX_NAME_BYTES = 255  # limit of nearly all file systems
 _MAX_STEM = 50  # characters of at most four bytes: keeps the temporary name within the limit
@@ -28,14 +27,14 @@ _LOCK_FLAGS = ("O_CREAT", "O_RDWR", "O_BINARY", "O_NOFOLLOW", "O_NONBLOCK")  # f
 _LOCKED = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 
-def check_regular_file(path: str | PathLike[str]) -> None:
+def check_regular_file(path: AnyPath) -> None:
     """Raise unless `path` can be opened and is no pipe or device: reading those could block or never end."""
     check(Path(path).is_dir() or stat.S_ISREG(Path(path).stat().st_mode), f"{path} is not a regular file")
     with open(path, "rb"):  # noqa: PTH123 - raises the error that names the path, for a folder too
         pass
 
 
-def checked_suffix(path: str | PathLike[str], suffixes: Sequence[str], what: str) -> str:
+def checked_suffix(path: AnyPath, suffixes: Sequence[str], what: str) -> str:
     """Return the suffix of a path in lower case. Raises a ValueError unless it is one of these, those of files of `what`."""
     suffix = path_of(path, "path").suffix.lower()
     check(suffix in suffixes, f"{path}: files of {what} end in {', '.join(suffixes)}")
@@ -43,7 +42,7 @@ def checked_suffix(path: str | PathLike[str], suffixes: Sequence[str], what: str
 
 
 @contextmanager
-def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> Iterator[None]:
+def reading(path: AnyPath, what: str, *errors: type[Exception]) -> Iterator[None]:
     """Turn a ValueError, or one of `errors`, raised in the block into a ValueError that `path` is not `what`."""
     kinds: tuple[type[Exception], ...] = (ValueError, *errors)
     try:
@@ -53,9 +52,7 @@ def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> I
         raise ValueError(msg) from error
 
 
-def check_outputs(
-    outputs: Iterable[str | PathLike[str] | None], inputs: Iterable[str | PathLike[str] | None] = ()
-) -> None:
+def check_outputs(outputs: Iterable[AnyPath | None], inputs: Iterable[AnyPath | None] = ()) -> None:
     """Raise, before the work, unless each output can be written, and is neither an input nor another output."""
     taken = {os.path.realpath(path): path for path in inputs if path is not None}
     for path in outputs:
@@ -70,14 +67,13 @@ def check_outputs(
         os.close(descriptor)
 
 
-def write_whole(path: str | PathLike[str], data: bytes) -> None:
-    """Write a file atomically; see :func:`whole_file`."""
+def write_whole(path: AnyPath, data: bytes) -> None:
     with whole_file(path) as file:
         file.write(data)
 
 
 @contextmanager
-def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
+def whole_file(path: AnyPath) -> Iterator[BinaryIO]:
     """Open a file for writing that replaces the one at `path` only once it is on the disk.
 
     If the block raises, the old file is unchanged. Links are followed, and the old file's permissions are kept. A killed
@@ -107,7 +103,7 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
         raise
 
 
-def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
+def _mode_to_keep(target: Path, named: AnyPath) -> int | None:
     if not target.exists():
         return None
     mode = target.stat().st_mode
@@ -186,7 +182,7 @@ def _lock(descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def check_fits_float32(path: str | PathLike[str], points: Floats) -> None:
+def check_fits_float32(path: AnyPath, points: Floats) -> None:
     """Raise a ValueError if float32 would round points (N, 3), m, by more than a millimetre."""
     near = np.abs(points).max(initial=0.0) <= _MAX_FLOAT32_M
     what = f"float32 coordinates are too coarse {_MAX_FLOAT32_M:g} m from the origin: write .ply"

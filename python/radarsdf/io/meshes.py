@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from radarsdf.arrays import Bytes, Floats
-from radarsdf.checks import check, path_of, positions
+from radarsdf.checks import AnyPath, check, path_of, positions
 from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.clouds import has_faces, ply_bytes, read_points
 from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, write_whole
@@ -26,7 +25,7 @@ _FLOAT32_SUFFIXES = (".stl", ".glb")
 _SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 
-def holds_mesh(path: str | PathLike[str]) -> bool:
+def holds_mesh(path: AnyPath) -> bool:
     """Whether a file is a mesh, by its suffix; for PLY, which may be a cloud too, by its header."""
     file = Path(path)
     suffix = file.suffix.lower()
@@ -35,7 +34,7 @@ def holds_mesh(path: str | PathLike[str]) -> bool:
     return suffix in MESH_SUFFIXES and not file.is_dir()
 
 
-def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
+def write_mesh(path: AnyPath, mesh: trimesh.Trimesh) -> None:
     """Write a mesh atomically.
 
     PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. In GLB, a rotation of the root turns the y axis
@@ -64,7 +63,7 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
     write_whole(path, exported.encode() if isinstance(exported, str) else exported)
 
 
-def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
+def read_mesh(path: AnyPath) -> trimesh.Trimesh:
     """Read a triangle mesh.
 
     Parameters
@@ -106,7 +105,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     return cast("trimesh.Trimesh", mesh)
 
 
-def read_ground_truth(path: str | PathLike[str]) -> Floats:
+def read_ground_truth(path: AnyPath) -> Floats:
     """Read points (M, 3), world, m, of a cloud or ``.npz`` file, or sample a mesh: the same file gives the same points."""
     file = Path(path)
     suffix = file.suffix.lower()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Array, Bytes
-from radarsdf.checks import check, instance, path_of
+from radarsdf.checks import AnyPath, check, instance, path_of
 from radarsdf.imu import Imu
 from radarsdf.io.files import check_regular_file, reading, whole_file
 from radarsdf.scans import Scans
@@ -31,7 +30,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
 TRUTH_ARRAYS = ("lidar_points", "ground_truth")  # the first of these that a file has is used
 
 
-def read_scans(path: str | PathLike[str]) -> Scans:
+def read_scans(path: AnyPath) -> Scans:
     """Read scans with poses from an ``.npz`` file.
 
     Parameters
@@ -115,7 +114,7 @@ def _check_rows(name: str, rows: Array, count: int, of: str) -> None:
     check(fits.all(), f"{name} must hold row indices of the {count} {of}")
 
 
-def write_scans(path: str | PathLike[str], scans: Scans) -> None:
+def write_scans(path: AnyPath, scans: Scans) -> None:
     """Write scans as an ``.npz`` file for :func:`read_scans`, atomically.
 
     Parameters
@@ -142,11 +141,8 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     single = {"poses": scans.poses, "times": scans.times_s, "lidar_points": scans.ground_truth}
     if (rig := scans.rig) is not None:
         labels = [str(label) for label in rig.labels]
-        single |= {
-            "sensor": rig.of_scan,
-            "sensor_labels": np.array(labels),
-            "T_body_sensor": rig.T_body_sensor,
-        }
+        single |= {"sensor": rig.of_scan, "sensor_labels": np.array(labels)}
+        single["T_body_sensor"] = rig.T_body_sensor
     if scans.imu is not None:
         single |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
     arrays |= {name: array for name, array in single.items() if array is not None}
@@ -162,7 +158,7 @@ def array_in(path: Path) -> Array:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
-def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, Array]:
+def arrays_of(path: AnyPath, names: Iterable[str]) -> dict[str, Array]:
     """Read those of the named arrays that an ``.npz`` file has, in this order. Raises the errors of :func:`read_scans`."""
     check_regular_file(path)
     arrays = {}
@@ -188,9 +184,7 @@ def check_arrays(arrays: Mapping[str, Array], wanted: Mapping[str, tuple[Any, ..
         check(fits, f"{name} is missing, or of another type or shape")
 
 
-def write_arrays(
-    path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
-) -> None:
+def write_arrays(path: AnyPath, arrays: Mapping[str, ArrayLike], *, compressed: bool = False) -> None:
     """Write an ``.npz`` file for :func:`arrays_of`, atomically."""
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
     with whole_file(path) as file:
@@ -202,7 +196,7 @@ def write_arrays(
         file.write(comment)
 
 
-def check_archive(path: str | PathLike[str]) -> None:
+def check_archive(path: AnyPath) -> None:
     """Raise a ValueError if a file of :func:`write_arrays` differs from what was written."""
     content = np.memmap(path, np.uint8, "r")
     size = len(_comment(content[:0]))

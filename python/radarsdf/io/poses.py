@@ -15,7 +15,16 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from radarsdf.arrays import Array, Bools, Floats
-from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, pose_matrices, real_array
+from radarsdf.checks import (
+    AnyPath,
+    are_rigid,
+    check,
+    check_pose,
+    check_poses,
+    path_of,
+    pose_matrices,
+    real_array,
+)
 from radarsdf.io.files import check_regular_file, checked_suffix, reading, write_whole
 from radarsdf.io.npz import array_in
 from radarsdf.io.text import Table, in_seconds, read_numbers, read_table, read_text
@@ -61,7 +70,6 @@ class Trajectory:
     held: bool = False  # each pose holds until the next one
 
     def span(self) -> str:
-        """First and last time, for messages."""
         return f"{self.times_s[0]} to {self.times_s[-1]} s"
 
     @cached_property
@@ -113,7 +121,6 @@ class TransformChain:
         return pose
 
     def span(self) -> str:
-        """First and last time of the moving links, for messages."""
         return ", ".join(link.span() for link in self.links if not isinstance(link, np.ndarray))
 
 
@@ -300,13 +307,13 @@ def read_calibration(path: Path) -> Floats | None:
         return check_pose(np.array([*numbers, 0, 0, 0, 1], np.float64).reshape(4, 4), "Tr")
 
 
-def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
+def check_pose_times(path: AnyPath, times_s: ArrayLike | None) -> None:
     """Raise a ValueError if the format of the file needs times and there are none."""
     possible = times_s is not None or path_of(path, "path").suffix.lower() != ".tum"
     check(possible, f"{path} needs times, s, and there are none: .kitti and .npy do without")
 
 
-def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike | None = None) -> None:
+def write_poses(path: AnyPath, poses: ArrayLike, times_s: ArrayLike | None = None) -> None:
     """Write a trajectory atomically.
 
     Parameters

@@ -11,30 +11,21 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import check, check_pose, path_of, positions, positive
+from radarsdf.checks import AnyPath, check, check_pose, path_of, positions, positive
 from radarsdf.imu import checked_rotation
 from radarsdf.io import datasets, recordings
+from radarsdf.io import poses as pose_files
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import READERS, read_points
 from radarsdf.io.fields import columns_of
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses import (
-    MAX_GAP_S,
-    POSE_FILES,
-    UNPOSED,
-    Poses,
-    StampedPoses,
-    poses_of,
-    read_transform,
-    rigid_or_nan,
-)
 from radarsdf.scans import Notes, Scans
 
 
 def read(
-    path: str | PathLike[str] | Sequence[str | PathLike[str]],
-    poses: str | PathLike[str] | ArrayLike | StampedPoses | None = None,
+    path: AnyPath | Sequence[AnyPath],
+    poses: AnyPath | ArrayLike | pose_files.StampedPoses | None = None,
     *,
     extrinsic: ArrayLike | None = None,
     topic: str | Sequence[str] | None = None,
@@ -45,8 +36,8 @@ def read(
     stamps: str | None = None,
     fields: Mapping[str, Any] | None = None,
     columns: int | Sequence[str] | None = None,
-    max_gap_s: float = MAX_GAP_S,
-    ground_truth: str | PathLike[str] | ArrayLike | None = None,
+    max_gap_s: float = pose_files.MAX_GAP_S,
+    ground_truth: AnyPath | ArrayLike | None = None,
 ) -> Scans:
     """Read scans with poses from a file, a folder or bags.
 
@@ -147,7 +138,7 @@ def read(
         max_gap_s=positive(max_gap_s, "max_gap_s"),
         notes=Notes(str(path) if single else "the bags"),
     )
-    if poses is UNPOSED:
+    if poses is pose_files.UNPOSED:
         request.refuse("scans are read without poses", *recordings.OF_POSES)
     scans = _read(paths[0], request) if single else read_bags(paths, request)
     if R_sensor_imu is not None and scans.imu is None:
@@ -168,8 +159,9 @@ def _read(path: Path, request: recordings.Request) -> Scans:
     bags = bags_in(path) if path.is_dir() and dataset is None else []
     if bags:  # NTU4DRadLM and Viking Hill have files next to them
         if request.extrinsic is None:
-            request = dataclasses.replace(request, extrinsic=read_transform(path / recordings.BASE_T_RADAR))
-        file = recordings.first_file([path], POSE_FILES)
+            T_base_sensor = pose_files.read_transform(path / recordings.BASE_T_RADAR)
+            request = dataclasses.replace(request, extrinsic=T_base_sensor)
+        file = recordings.first_file([path], pose_files.POSE_FILES)
         if file is not None and request.poses is None and request.pose_topic is None:
             request.notes.add(f"poses: of {file.name}")
             request = dataclasses.replace(request, poses=file)
@@ -191,25 +183,19 @@ def _npz(path: Path, request: recordings.Request) -> Scans:
     notes = request.notes
     request.refuse(f"{path} has names of columns", "columns")
     scans = read_scans(path)
-    if own := request.poses is None or request.poses is UNPOSED:
+    if own := request.poses is None or request.poses is pose_files.UNPOSED:
         request.refuse(f"{path} contains its own poses", "extrinsic")
-        poses: Poses = rigid_or_nan(scans.poses, str(path), notes)
+        poses: pose_files.Poses = pose_files.rigid_or_nan(scans.poses, str(path), notes)
     else:
-        poses = poses_of(request.poses, notes)
+        poses = pose_files.poses_of(request.poses, notes)
         notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
     times_s = None if scans.times_s is None else scans.times_s.tolist()
     matched, _ = recordings.scan_poses(poses, len(scans), times_s, request.extrinsic, request)
     mountings = scans.T_body_sensor
-    raw_scans = [
-        recordings.RawScan(
-            partial(columns_of, s, s.points),
-            s.time_s,
-            f"{path}: scan {i}",
-            str(s.sensor or ""),
-            sensor=s.sensor,
-        )
-        for i, s in enumerate(scans)
-    ]
+    raw_scans = []
+    for i, s in enumerate(scans):
+        read, name = partial(columns_of, s, s.points), f"{path}: scan {i}"
+        raw_scans.append(recordings.RawScan(read, s.time_s, name, str(s.sensor or ""), sensor=s.sensor))
     truth, imu = scans.ground_truth if own else None, scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)

@@ -7,14 +7,13 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from os import PathLike
 from typing import Any
 
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from radarsdf.checks import check
+from radarsdf.checks import AnyPath, check
 
 _CHECKSUMS = "crc32"  # key of the metadata: CRC-32 of each tensor by name, and of the other metadata as ""
 
@@ -55,7 +54,6 @@ class TensorFile:
         return found
 
     def check_metadata(self) -> None:
-        """Raise a ValueError if the metadata or the names of the arrays differ from those written."""
         _ = self.checksums
 
     def array(self, name: str) -> Any:
@@ -68,7 +66,6 @@ class TensorFile:
 
 
 @contextmanager
-def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[TensorFile]:
-    """Open a safetensors file with arrays of this `framework`."""
+def open_tensors(path: AnyPath, framework: str = "pt") -> Iterator[TensorFile]:
     with safe_open(path, framework=framework) as file:
         yield TensorFile(file)

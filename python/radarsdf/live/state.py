@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from radarsdf._core import QUANTA, GrowingSums, SumsChange
 from radarsdf.arrays import Array, Floats, Keys
-from radarsdf.checks import check
+from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
 from radarsdf.interrupts import at_once
@@ -53,14 +52,10 @@ class GrowingState:
     ) -> None:
         self.config = config
         self.mountings = mountings
-        self.quick = FitConfig.quick(  # with the same cells, returns, bridges, seed and limits
-            leaf_size_m=config.leaf_size_m,
-            seed=config.seed,
-            num_threads=config.num_threads,
-            max_memory_bytes=config.max_memory_bytes,
-            returns=config.returns,
-            encoding={"bridge_cells": config.encoding.bridge_cells},
-        )
+        # With the same cells, returns, bridges, seed and limits.
+        names = ("leaf_size_m", "seed", "num_threads", "max_memory_bytes", "returns")
+        same = {name: getattr(config, name) for name in names}
+        self.quick = FitConfig.quick(**same, encoding={"bridge_cells": config.encoding.bridge_cells})
         self.origin = origin
         self.max_bytes = max_bytes
         self.log = ScanLog(folder)
@@ -176,7 +171,7 @@ class GrowingState:
         self._changed.clear()
         return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
         ids: list[Any] = [*self.log.ids, *self.log.sealed]
         mountings: list[Any] | None = None
@@ -254,12 +249,7 @@ class GrowingState:
 def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: Floats | None) -> Rays:
     """Return the rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
     static = [scan.static for scan in scans]
-    return prepare(
-        [scan.points for scan in static],
-        np.stack([scan.T_world_sensor for scan in static]),
-        [scan.intensities for scan in static if scan.intensities is not None] or None,
-        origin=origin,
-        whole=False,
-        rig=rig_of_scans(static),
-        **config.preparation,
-    )
+    poses = np.stack([scan.T_world_sensor for scan in static])
+    values = [scan.intensities for scan in static if scan.intensities is not None] or None
+    options = config.preparation | {"origin": origin, "whole": False, "rig": rig_of_scans(static)}
+    return prepare([scan.points for scan in static], poses, values, **options)

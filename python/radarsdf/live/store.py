@@ -7,7 +7,6 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from radarsdf._core import GrowingSums
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Keys
-from radarsdf.checks import MAX_POSITION_M, check, check_pose, check_values_of_scan, positions
+from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, check_values_of_scan, positions
 from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.regions import REGION_BITS
@@ -78,7 +77,6 @@ class LoggedScan:
 
     @property
     def arrays(self) -> dict[str, Array]:
-        """Existing arrays by name."""
         return {name: array for name in _KINDS if (array := getattr(self, name)) is not None}
 
     @property
@@ -97,7 +95,6 @@ class LoggedScan:
 
 
 def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
-    """Return the radars of the scans, if there are several."""
     known = [scan.radar for scan in scans if scan.radar is not None]
     return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
@@ -176,19 +173,16 @@ class ScanLog:
         self.num_bytes += scan.num_bytes - (0 if before is None else before.num_bytes)
 
     def exchanged(
-        self,
-        come: Mapping[ScanId, LoggedScan | _OnDisk],
-        gone: Iterable[ScanId],
-        sealed: Sequence[ScanId] = (),
+        self, new: Mapping[ScanId, LoggedScan | _OnDisk], old: Iterable[ScanId], sealed: Sequence[ScanId] = ()
     ) -> ScanLog:
-        """Return a log without the scans `gone`, and with those of `come`. Ids in both keep their place."""
+        """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
         log = copy(self)
         log._scans = self._scans.copy()
         if sealed:
             log.sealed = self.sealed.union(sealed)
-        for scan_id in set(gone).union(sealed) - come.keys():
+        for scan_id in set(old).union(sealed) - new.keys():
             log.num_bytes -= log._scans.pop(scan_id).num_bytes
-        for scan_id, scan in come.items():
+        for scan_id, scan in new.items():
             log._written += isinstance(scan, _OnDisk)
             log.put(scan_id, scan)
         return log
@@ -310,10 +304,7 @@ class Described(BaseModel):
         return None if self.mountings is None else checked_mountings(dict(self.mountings))
 
 
-def save_state(
-    path: str | PathLike[str], described: Described, scans: Iterable[LoggedScan], sums: GrowingSums
-) -> None:
-    """Write a state atomically."""
+def save_state(path: AnyPath, described: Described, scans: Iterable[LoggedScan], sums: GrowingSums) -> None:
     arrays = arrays_of_sums(sums, sums.block_keys())
     for i, scan in enumerate(scans):
         arrays |= {f"{name} {i}": array for name, array in scan.arrays.items()}
@@ -321,7 +312,7 @@ def save_state(
     write_arrays(path, arrays)
 
 
-def load_state(path: str | PathLike[str]) -> tuple[Described, list[LoggedScan], tuple[Array, ...]]:
+def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array, ...]]:
     """Read a state written by :func:`save_state`, with the columns of its sums."""
     check_regular_file(path)
     with reading(path, "the state of a live map of this version, or it is damaged", KeyError, TypeError):

@@ -68,7 +68,6 @@ class GrowingSurface:
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all tables, bytes."""
         return sum(table.num_bytes for table in (self._leaves, self._cells, self._crossed, self.distances))
 
     def update(self, blocks: Keys, sums: ScanSums, noise: SensorNoise, num_threads: int) -> Keys:

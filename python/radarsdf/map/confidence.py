@@ -139,10 +139,9 @@ def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     expected = CELLS_OF_SURFACE * _DETECTION_RATE * visibility
     deviations = (expected - hits) / (expected + 1).sqrt()
     missing = (deviations + deviations.square().add(_SMOOTH**2).sqrt()) / 2  # a smooth max(0, deviations)
-    of_map = (
-        math.tanh(contents.clutter_ratio / _ROUGH_CLUTTER_RATIO),
-        contents.returns_per_cell / (contents.returns_per_cell + _CROWDED_RETURNS),
-    )
+    per_cell = contents.returns_per_cell
+    cluttered = math.tanh(contents.clutter_ratio / _ROUGH_CLUTTER_RATIO)
+    of_map = cluttered, per_cell / (per_cell + _CROWDED_RETURNS)
     rough, crowded = (torch.full_like(error_cells, value) for value in of_map)
     return torch.stack([torch.ones_like(error_cells), error_cells.log(), missing, rough, crowded], 1)
 

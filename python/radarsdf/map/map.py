@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property, partial
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from radarsdf.arrays import Array, Bools, Floats
-from radarsdf.checks import MAX_POSITION_M, check, check_pose, instance, real_array
+from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -229,14 +228,9 @@ class Map(ABC):
             sensor_position = real_array(viewpoint, "viewpoint")
             is_position = sensor_position.shape == (3,) and (np.abs(sensor_position) <= MAX_POSITION_M).all()
             check(is_position, f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m")
-        mesh: Any = self._surface_mesh(
-            voxel_size,
-            box=box,
-            progress=progress,
-            min_confidence=min_confidence,
-            max_uncertainty=max_uncertainty,
-            min_component_triangles=min_component_triangles,
-        )
+        limits: dict[str, Any] = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
+        limits["min_component_triangles"] = min_component_triangles
+        mesh: Any = self._surface_mesh(voxel_size, box=box, progress=progress, **limits)
         if viewpoint is None or scale is None:
             return mesh
         values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position).astype(np.float32)
@@ -304,7 +298,7 @@ class Map(ABC):
         return self.sensors[sensor]
 
     @abstractmethod
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the map to a safetensors file. After :func:`radarsdf.load`, all results are bit-identical.
 
         An existing file is replaced only once the new one is complete. Raises an OSError if the file cannot be written.

@@ -45,14 +45,10 @@ class Surface:
 
     @classmethod
     def of(
-        cls,
-        contents: MapContents,
-        voxel_size: float,
-        box: Floats | None = None,
-        progress: bool | None = False,
+        cls, contents: MapContents, voxel_m: float, box: Floats | None = None, progress: bool | None = False
     ) -> Surface:
         """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
-        vertices, faces, searched = extract_triangles(contents, voxel_size, box, progress)
+        vertices, faces, searched = extract_triangles(contents, voxel_m, box, progress)
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
         points = queries.to_local(contents, vertices + contents.origin)
         return cls.from_triangles(contents, vertices, faces, evidence(contents, points), searched)

@@ -73,21 +73,17 @@ def occupied(contents: MapContents, points: Floats32) -> Bools:
 
 @torch.inference_mode(mode=False)  # gradients, for normals, need ordinary tensors
 def evaluate(
-    function: Callable[[Tensor], Tensor],
-    points: Floats32,
-    *,
-    description: str = "",
-    progress: bool | None = False,
+    f: Callable[[Tensor], Tensor], points: Floats32, *, description: str = "", progress: bool | None = False
 ) -> Array:
-    """Evaluate function(points) without gradients, in chunks, on the number of threads of PyTorch."""
+    """Evaluate f(points) without gradients, in chunks, on the number of threads of PyTorch."""
     rows = torch.from_numpy(points)
     if len(rows) <= _CHUNK:
         start_vector_library()  # the first queries may be concurrent
         with torch.no_grad():
-            return function(rows).numpy()
+            return f(rows).numpy()
     chunks = torch.split(rows, _CHUNK)
     with ThreadPool() as pool:
-        results = pool.map(torch.no_grad()(function), chunks)
+        results = pool.map(torch.no_grad()(f), chunks)
         bar = tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress))
         return torch.cat(list(bar)).numpy()
 

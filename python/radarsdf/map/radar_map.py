@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from safetensors.torch import load, save
 
 from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.checks import AnyPath
 from radarsdf.field.field import Field
 from radarsdf.map import queries, storage
 from radarsdf.map.confidence import EvidenceAt, evidence
@@ -85,7 +85,7 @@ class RadarMap(Map):
 
         return ViewedMap.of(self._contents)
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         storage.save_contents(self._contents, path)
 
     @property

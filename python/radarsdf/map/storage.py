@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from torch import Tensor
 from typing_extensions import TypedDict
 
 from radarsdf.arrays import Array, Keys
-from radarsdf.checks import check
+from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, GridField
 from radarsdf.field.neural_field import NeuralField
@@ -50,7 +49,7 @@ _PARTS = {
 }  # fmt: skip
 
 
-def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
+def save_contents(contents: MapContents, path: AnyPath) -> None:
     """Write a map to one file, atomically. Raise a ValueError if a number is not finite: it could not be loaded."""
     tensors, description = parts_of(contents)
     for name, tensor in tensors.items():
@@ -60,7 +59,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
 
 
 @torch.inference_mode(mode=False)  # or the map could not compute gradients
-def load_contents(path: str | PathLike[str]) -> MapContents:
+def load_contents(path: AnyPath) -> MapContents:
     """Read the file of a map. Raise a ValueError if it is damaged, of another program or of another version."""
     check_regular_file(path)
     with reading(path, "a complete radarsdf map", Exception), open_tensors(path) as file:
@@ -73,7 +72,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
         return contents_of(tensors, json.loads(file.metadata["description"]))
 
 
-def load_leaf_keys(path: str | PathLike[str]) -> Keys:
+def load_leaf_keys(path: AnyPath) -> Keys:
     """Read the ascending Morton keys (C,) of the leaf cells of a map, and nothing else of its file."""
     with reading(path, "a complete radarsdf map", SafetensorError), open_tensors(path, "np") as file:
         keys: Array = file.array("leaf_keys")

@@ -79,7 +79,6 @@ class View:
 
 
 def scans_of_views(views: Iterable[View]) -> Scans:
-    """Convert views to scans, one each."""
     kept = list(views)
     poses = np.array([view.T_world_sensor for view in kept]).reshape(-1, 4, 4)
     values = [view.intensities for view in kept if view.intensities is not None]

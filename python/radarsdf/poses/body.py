@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import Self
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.poses.doppler import SensorVelocities
@@ -84,27 +85,21 @@ class BodyVelocities(SensorVelocities):
             change = np.multiply.outer(apart_s**2 / 12 / durations_s + beyond_s, np.diag(changes[-1]))
             ends = (covariance[before] + covariance[after]) / 4
             variances.append(ends * (apart_s / durations_s)[:, None, None] + change)
-        return cls(
-            mean,
-            covariance,
-            np.min(changes, axis=0),  # they include the noise of each radar
-            [np.zeros(0, bool)] * count,  # moving returns were left out before
-            np.ones(count, bool),
-            common_sigma=max(velocities.common_sigma for _, velocities in measured),
-            clock_sigma_s=max(velocities.clock_sigma_s for _, velocities in measured),
-            of_radars_mps=np.stack(of_radars_mps),
-            variances=np.stack(variances),
-            levers=skew(np.stack([mountings[rows[0], :3, 3] for rows, _ in measured])),
-        )
+        change = np.min(changes, axis=0)  # they include the noise of each radar
+        none, found = [np.zeros(0, bool)] * count, np.ones(count, bool)  # moving returns were left out before
+        levers = skew(np.stack([mountings[rows[0], :3, 3] for rows, _ in measured]))
+        of_radars, of_steps = np.stack(of_radars_mps), np.stack(variances)
+        names = ("common_sigma", "clock_sigma_s")
+        largest = {name: max(getattr(velocities, name) for _, velocities in measured) for name in names}
+        body = mean, covariance, change, none, found
+        return cls(*body, of_radars_mps=of_radars, variances=of_steps, levers=levers, **largest)
 
-    def select(self, rows: slice | Ints) -> SensorVelocities:
+    def select(self, rows: slice | Ints) -> Self:
         """Select consecutive scans; of others, velocities without those of steps."""
         found = super().select(rows)
-        assert isinstance(found, BodyVelocities)
         steps = slice(rows.start, rows.stop - 1) if isinstance(rows, slice) else slice(0)
-        return dataclasses.replace(
-            found, of_radars_mps=self.of_radars_mps[:, steps], variances=self.variances[:, steps]
-        )
+        of_radars_mps, variances = self.of_radars_mps[:, steps], self.variances[:, steps]
+        return dataclasses.replace(found, of_radars_mps=of_radars_mps, variances=variances)
 
     def learnt(self, turn_rates: Sequence[MotionRate | None]) -> BodyVelocities:
         """Remove the mean difference of each radar from the others, given turn rates (F - 1), rad/s; None: unknown."""
@@ -113,7 +108,6 @@ class BodyVelocities(SensorVelocities):
             return self
         rates = np.stack([rate.mean for rate in turn_rates if rate is not None])
         mean_mps, _, levers = self.of_steps
-        assert levers is not None
         body_mps = mean_mps[rows] + np.einsum("fij,fj->fi", levers[rows], rates)
         off = self.of_radars_mps[:, rows] - body_mps + np.einsum("kij,fj->kfi", self.levers, rates)
         information = self._information[:, rows]
@@ -132,7 +126,7 @@ class BodyVelocities(SensorVelocities):
         return variances @ self._information, variances
 
     @cached_property
-    def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
+    def of_steps(self) -> tuple[Floats, Floats, Floats]:
         weights, _ = self._weights
         mean = np.einsum("kfij,kfj->fi", weights, self.of_radars_mps)
         return mean, mean, np.einsum("kfij,kjl->fil", weights, self.levers)
@@ -146,7 +140,6 @@ class BodyVelocities(SensorVelocities):
     def turn_given(self, turn: MotionRate, i: int, duration_s: float) -> MotionRate:
         """Return a turn (rad) in the step from scan `i`, given the differences of the velocities of the radars."""
         mean_mps, _, levers = self.of_steps
-        assert levers is not None
         if duration_s == 0 or not self.agree:
             return turn
         apart = (self.levers - levers[i]) / duration_s
@@ -159,6 +152,7 @@ class BodyVelocities(SensorVelocities):
         return MotionRate(turn.mean + covariance @ gradient, covariance)
 
     def measure_turns(self, durations_s: Floats, least: float) -> bool:
+        """Whether these velocities remove at least this share of the variance of yaws between scans."""
         usual = MotionRate(np.zeros(3), _TURN_RAD_S**2 * np.eye(3))
         steps = [(i, usual.integrate(d), d) for i, d in enumerate(durations_s.tolist()) if d > 0]
         left = [self.turn_given(turn, i, d).covariance[2, 2] / turn.covariance[2, 2] for i, turn, d in steps]

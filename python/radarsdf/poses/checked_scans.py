@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +16,9 @@ from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities, 
 from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Rig
-from radarsdf.scans import Scans, chosen, filled, rig_of
+from radarsdf.scans import Scans, chosen, filled
+
+_Points: TypeAlias = Iterable[ArrayLike] | Scans
 
 _MOST_M = 500.0  # maximum median range, m. Imaging radars reach 300 m
 _INTERVALS_S = 0.002, 20.0  # limits of the median scan interval: 500 Hz, and no overlap of moving scans
@@ -35,15 +38,12 @@ class CheckedScans:
 
     @classmethod
     def of(
-        cls,
-        points: Iterable[ArrayLike] | Scans,
-        doppler_mps: Sequence[ArrayLike] | None,
-        times: ArrayLike | None,
+        cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None
     ) -> CheckedScans:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
         fits = doppler_mps is None or times is not None or isinstance(points, Scans)
         check(fits, "Doppler needs times: the time of each scan (times_s), s")
-        given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
+        _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
         if (range_m := median_range_m(scans)) > _MOST_M:
             msg = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
@@ -54,10 +54,7 @@ class CheckedScans:
             begin_s = float(times_s[0])
             times_s, repeated = spread_times(times_s - begin_s)
             if repeated:
-                notes = [
-                    *notes,
-                    f"{repeated} scans repeat the time of the one before: they are spread evenly.",
-                ]
+                notes = [*notes, f"{repeated} scans repeat the previous time: they are spread evenly."]
         if doppler_mps is None or times_s is None:
             return cls(scans, times_s, begin_s, None, 0, notes)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
@@ -79,25 +76,19 @@ class CheckedScans:
 
     @classmethod
     def of_radars(
-        cls,
-        points: Iterable[ArrayLike] | Scans,
-        doppler_mps: Sequence[ArrayLike] | None,
-        times: ArrayLike | None,
+        cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None
     ) -> tuple[Rig | None, list[tuple[Ints, CheckedScans]]]:
         """:meth:`of` for each radar: its scans (K,), checked; and the rig if there are several radars."""
-        rig = rig_of(points)
+        rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)
         if rig is None:
             found = cls.of(points, doppler_mps, times)
             return None, [(np.arange(len(found.scans)), found)]
-        check(
-            rig.T_body_sensor is not None, "T_body_sensor is missing: the mounting of each radar of the rig"
-        )
-        given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
-        times_s = None if times is None else _checked_times(times, len(given))
+        check(rig.T_body_sensor is not None, "T_body_sensor is missing: the mounting of each radar")
+        times_s = None if times_ is None else _checked_times(times_, len(given))
         radars = []
         for rows in rig.scans_of_radars().values():
             own_s = None if times_s is None else times_s[rows]
-            checked = cls.of([given[i] for i in rows], chosen(doppler_mps, rows), own_s)
+            checked = cls.of([given[i] for i in rows], chosen(speeds, rows), own_s)
             if checked.times_s is not None and times_s is not None:
                 since_s = checked.times_s + (checked.begin_s - times_s[0])
                 checked = dataclasses.replace(checked, times_s=since_s, begin_s=float(times_s[0]))

@@ -153,9 +153,7 @@ class Consistency:
         if not self.doubts:
             return velocities, []
         scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
-        return velocities, [
-            f"Assumed: the Doppler is right; the returns of the scans {scans} do not decide its scale."
-        ]
+        return velocities, [f"Assumed: the Doppler is right; scans {scans} do not decide its scale."]
 
 
 def _relative_differences(
@@ -164,10 +162,8 @@ def _relative_differences(
     """Return differences (F - 1,) of tracked steps from those by Doppler, relative to these; NaN where returns hardly observe them."""
     own = motion.steps[:, :3, 3]
     along = np.einsum("ki,ki->k", shown - own, own) / np.maximum((own**2).sum(axis=1), 1e-12)
-    before, left = (
-        np.einsum("ki,kij,kj->k", own, each, own)
-        for each in (prior.step_covariances(motion.durations_s), covariance)
-    )
+    before = np.einsum("ki,kij,kj->k", own, prior.step_covariances(motion.durations_s), own)
+    left = np.einsum("ki,kij,kj->k", own, covariance, own)
     seen = 1 - left / np.maximum(before, 1e-30)
     # Without the share of the prior.
     return np.where(seen > _LEAST_SEEN, along / np.maximum(seen, _LEAST_SEEN), np.nan)
@@ -187,16 +183,11 @@ class _Pairs:
 
     @classmethod
     def of(
-        cls,
-        scans: list[Floats],
-        motion: DopplerMotion,
-        along: Floats,
-        rows: Ints,
-        reversed_yaws: Floats | None,
+        cls, scans: list[Floats], motion: DopplerMotion, along: Floats, rows: Ints, yaws: Floats | None
     ) -> _Pairs:
         """Compare the returns of scans `rows` (K,) with those of the next ones, at the rotations of tracked poses.
 
-        `reversed_yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
+        `yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
         """
         scales = len(_SCALES)
         gains, losses, moved = [], [], []
@@ -204,11 +195,10 @@ class _Pairs:
             step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
             shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])
             turns = [motion.steps[i, :3, :3]]
-            if reversed_yaws is not None and np.isfinite(reversed_yaws[i]):
-                turns.append(rotation(np.array([0.0, 0.0, reversed_yaws[i]])))
-            apart = np.min(
-                [log_distances(scans[i], scans[i + 1] @ turn.T, shifts_m) for turn in turns], axis=0
-            )
+            if yaws is not None and np.isfinite(yaws[i]):
+                turns.append(rotation(np.array([0.0, 0.0, yaws[i]])))
+            turned = [scans[i + 1] @ turn.T for turn in turns]
+            apart = np.min([log_distances(scans[i], scan, shifts_m) for scan in turned], axis=0)
             ahead, back, still, shifted = np.split(apart, [scales, 2 * scales, 2 * scales + 1])
             gains.append(back - ahead)
             losses.append(shifted - still)
@@ -217,7 +207,6 @@ class _Pairs:
         return cls(np.array(gains), np.array(losses), np.array(moved), along[rows], slow)
 
     def select(self, rows: slice | Bools) -> _Pairs:
-        """Select pairs."""
         return _Pairs(*(column[rows] for column in vars(self).values()))
 
     def __len__(self) -> int:
@@ -276,9 +265,8 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             losses, of_each = still.losses, level / len(_SHIFTS_M)
             opposite = np.subtract(*np.split(losses, 2, axis=1))
             # After a motion d, log distances after opposite shifts s differ by log((s + d) / (s - d)), about 2 d / s.
-            moved_m = (
-                np.abs(opposite.mean(axis=0)) * np.linalg.norm(_SHIFTS_M[: opposite.shape[1]], axis=1) / 2
-            )
+            shifts_m = np.linalg.norm(_SHIFTS_M[: opposite.shape[1]], axis=1)
+            moved_m = np.abs(opposite.mean(axis=0)) * shifts_m / 2
             evidence = np.where(moved_m > LEAST_M, np.abs(_significance(opposite, of_each)), 0.0)
             found.append((True, float(evidence.max()), None))
             # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
@@ -288,11 +276,9 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             found += [(True, *other) for other in moving.others(level)]
             if abs(moving.farthest - 1) > _MEASURED:
                 doubts.append(OtherMotion(first, last, moving.farthest, confirmed=False))
-        contradictions += [
-            (confirmed, excess, OtherMotion(first, last, ratio, confirmed))
-            for confirmed, excess, ratio in found
-            if excess > 1
-        ]
+        for confirmed, excess, ratio in found:
+            if excess > 1:
+                contradictions.append((confirmed, excess, OtherMotion(first, last, ratio, confirmed)))
     clearest = max(contradictions, key=lambda one: one[:2])[2] if contradictions else None
     return clearest, tuple(doubts)
 

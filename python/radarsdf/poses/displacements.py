@@ -34,7 +34,6 @@ class OtherMotion:
     confirmed: bool = True  # by the other source. Else this source observes neither motion nor its absence
 
     def words(self, source: str) -> str:
-        """Describe in words, without a full stop."""
         scans = f"from scan {self.first} to {self.last}"
         if self.ratio is None:
             return f"{scans}, it shows no motion, which {source} do not confirm"
@@ -83,9 +82,8 @@ def contradiction(
         if abs(share) <= max(needed, ERRORS / np.sqrt(information)) + _SAME_SPEED:
             continue
         if (excess := abs(share) - needed) > worst:
-            by_doppler, by_other = (
-                float((weights * np.einsum("ki,ki->k", moves, longer)).sum()) for moves in (doppler, shown)
-            )
+            by_doppler = float((weights * np.einsum("ki,ki->k", doppler, longer)).sum())
+            by_other = float((weights * np.einsum("ki,ki->k", shown, longer)).sum())
             ratio = by_other / by_doppler if abs(by_doppler) > 0.05 * abs(by_other) else None
             worst, found = excess, OtherMotion(int(scans[rows.start]), int(scans[rows.stop]), ratio)
     return found

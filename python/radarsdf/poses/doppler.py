@@ -9,12 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
-from radarsdf.poses.motion import KnownMotion, MotionRate, spans_of, turned_halfway, usual_duration_s, way
+from radarsdf.poses.motion import KnownMotion, spans_of, turned_halfway, usual_duration_s, way
 from radarsdf.poses.rigid import rotation, rotation_vector, step_vectors, steps
 from radarsdf.products import normal_matrix
-from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, folding_interval_mps, sensor_velocities
+from radarsdf.returns.moving import (
+    MIN_DOPPLER_RETURNS,
+    SensorVelocity,
+    folding_interval_mps,
+    sensor_velocities,
+)
 
 _SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
 _FEW_SAMPLED = 100  # returns of a scan, where many pairs are compared
@@ -61,6 +67,7 @@ class SensorVelocities:
     common_sigma: float = _IN_COMMON
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
+    of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
 
     @classmethod
     def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> SensorVelocities:
@@ -90,15 +97,12 @@ class SensorVelocities:
             mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
             away_s = np.abs(at - times_s[i]).min()
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
-        return cls(mean, covariance, change, static, found, climb_assumed=weak)
+        return cls(mean, covariance, change, static, found, climb_assumed=weak, of_scans=each)
 
-    def select(self, rows: slice | Ints) -> SensorVelocities:
-        """Select scans."""
-        mean_mps, covariance = self.mean_mps[rows], self.covariance[rows]
+    def select(self, rows: slice | Ints) -> Self:
         static = [self.static[i] for i in np.arange(len(self.static))[rows]]
-        return dataclasses.replace(
-            self, mean_mps=mean_mps, covariance=covariance, static=static, found=self.found[rows]
-        )
+        columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
+        return dataclasses.replace(self, static=static, of_scans=(), **columns)
 
     @property
     def usual_mps(self) -> float:
@@ -115,18 +119,6 @@ class SensorVelocities:
     def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
         """Velocities at the beginning and the end of steps, (F - 1, 3) each, and derivatives by turn rates, (F - 1, 3, 3) m."""
         return self.mean_mps[:-1], self.mean_mps[1:], None
-
-    def learnt(self, turn_rates: Sequence[MotionRate | None]) -> SensorVelocities:  # noqa: ARG002 - for several radars
-        """Return velocities whose systematic errors are estimated from turn rates (F - 1), rad/s; None: unknown."""
-        return self
-
-    def measure_turns(self, durations_s: Floats, least: float) -> bool:  # noqa: ARG002 - for several radars
-        """Whether these velocities remove at least this share of the variance of yaws between scans."""
-        return False
-
-    def turn_given(self, turn: MotionRate, i: int, duration_s: float) -> MotionRate:  # noqa: ARG002 - for several radars
-        """Return a turn in the step from scan `i` given these velocities, rad."""
-        return turn
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
         """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
@@ -216,7 +208,6 @@ class DopplerMotion(KnownMotion):
         return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
     def at(self, poses: Floats) -> DopplerMotion:
-        """Update the translations for the rotations of `poses`."""
         return self.turned(steps(poses)[:, :3, :3])
 
     def turned(self, rotations: Floats) -> DopplerMotion:

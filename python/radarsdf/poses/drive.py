@@ -12,6 +12,7 @@ from tqdm import tqdm
 from radarsdf.arrays import Floats
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.poses.body import BodyVelocities
 from radarsdf.poses.doppler import YAW_STEP_RAD, DopplerMotion, SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import (
@@ -79,7 +80,8 @@ class Drive:
                 turned = MotionRate(mean, before - np.outer(gain, before[2]))
         lever = None
         if self.velocities is not None:
-            turned = self.velocities.turn_given(turned, i - 1, duration_s)
+            if isinstance(self.velocities, BodyVelocities):
+                turned = self.velocities.turn_given(turned, i - 1, duration_s)
             covariance = self.velocities.step_covariance(i - 1, duration_s)
             begins, ends, levers = self.velocities.of_steps
             begin, end = begins[i - 1], ends[i - 1]
@@ -150,13 +152,9 @@ def track_drive(
             turns = MotionPrior(usual, usual, True)
         steady_moves = moves.learnt(move_rates, durations_s, with_errors=True)
         steady_turns = turns.learnt(turn_rates, durations_s, with_errors=True)
-        drive = dataclasses.replace(
-            drive,
-            turns=turns.learnt(turn_rates, durations_s),
-            moves=moves.learnt(move_rates, durations_s),
-            steady=(steady_moves, steady_turns),
-        )
-        if i == 0 and drive.velocities is not None:
+        turns, moves = turns.learnt(turn_rates, durations_s), moves.learnt(move_rates, durations_s)
+        drive = dataclasses.replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
+        if i == 0 and isinstance(drive.velocities, BodyVelocities):
             drive = dataclasses.replace(drive, velocities=drive.velocities.learnt(turn_rates))
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.

@@ -90,7 +90,6 @@ class ImuAlignment:
 
     @property
     def words(self) -> str:
-        """Summary in one sentence."""
         how = f"found to {np.degrees(self.sigma_rad):.1f} degrees" if self.sigma_rad > 0 else "given"
         return f"The IMU's axes were {how}, scans are {self.time_offset_s:.3f} s late in its clock, and its accelerometer gives the vertical."
 
@@ -290,7 +289,6 @@ class Inertial:
         return cls(Gyroscope.of(rates, imu.times_s, times_s))
 
     def without(self, why: object) -> Inertial:
-        """Drop the gyroscope, with a note on the reason."""
         return Inertial(None, notes=(*self.notes, f"The gyroscope is not used: {why}."))
 
     @property

@@ -78,8 +78,6 @@ class MotionPrior:
 
 @dataclass(frozen=True)
 class MotionRate:
-    """Rate with its covariance."""
-
     mean: Floats  # (3,)
     covariance: Floats  # (3, 3)
 
@@ -113,9 +111,8 @@ class PredictedStep:
     end_mps: Floats  # (3,) velocity at the second scan, in its frame
     translation_covariance: Floats  # (3, 3) of the translation given the turn, m²
     duration_s: float
-    lever: Floats | None = (
-        None  # (3, 3) derivative of the translation by the turn, if radars have lever arms, m
-    )
+    # (3, 3) derivative of the translation by the turn, if radars have lever arms, m
+    lever: Floats | None = None
 
     def pose(self, turn: Floats | None = None) -> Floats:
         """Return the pose (..., 4, 4) after rotation vectors `turn` (..., 3). None: the predicted one."""
@@ -279,13 +276,11 @@ class SteadyMotion(KnownMotion):
     usual: Floats  # (2,) variances of a step given the usual rates only, m² and rad²
 
     @classmethod
-    def by(
-        cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, measured: Bools
-    ) -> SteadyMotion:
-        """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `measured` by other sources."""
+    def by(cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools) -> SteadyMotion:
+        """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `known` by other sources."""
         spans = spans_of(times_s, len(times_s))
         duration_s = usual_duration_s(np.diff(times_s))
-        shares = np.tile(np.where(measured, np.inf, 1.0), (len(spans), 1))
+        shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
         unknown = np.zeros(6), np.ones(2), shares, spans
         return cls(steps(poses), *unknown, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 

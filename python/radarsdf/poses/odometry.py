@@ -15,7 +15,7 @@ from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
-from radarsdf.poses.body import MeasuredScans, join_radars
+from radarsdf.poses.body import BodyVelocities, MeasuredScans, join_radars
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance, turns_fast
@@ -255,7 +255,7 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
     if drive.velocities is None and moved < LEAST_OBSERVED:
         refuse("moved", removed.format(moved, LEAST_OBSERVED), doppler)
     durations_s, velocities = np.diff(drive.times_s), drive.velocities
-    measured = velocities is not None and velocities.measure_turns(durations_s, least_turned)
+    measured = isinstance(velocities, BodyVelocities) and velocities.measure_turns(durations_s, least_turned)
     unknown = not measured and drive.gyroscope is None and turned < least_turned
     if unknown and not drive.turns_slowly:
         refuse("turned", removed.format(turned, least_turned), "a gyroscope (imu)")

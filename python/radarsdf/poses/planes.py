@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -114,11 +114,9 @@ class SensorReturns:
         return len(self.scans)
 
     def select(self, part: Bools) -> SensorReturns:
-        """Select returns by a mask (N,)."""
         return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part], self.rig)
 
     def every(self, step: int) -> SensorReturns:
-        """Return every `step`-th return."""
         return self.select(np.arange(len(self)) % step == 0)
 
     def posed(self, poses: Floats) -> Rays:
@@ -133,8 +131,10 @@ class SensorReturns:
         positions = (poses[:, :3, 3] - origin).astype(np.float32)
         points = directions * self.ranges_m[:, None] + positions[self.scans]
         up = poses[:, :3, 2].copy()
-        sensors = None if self.rig is None else self.rig.of_scan
-        return Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self), sensors)
+        rays = Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self))
+        if self.rig is None:
+            return rays
+        return replace(rays, sensor_of_scan=self.rig.of_scan, num_sensors=len(self.rig.labels))
 
 
 @dataclass(frozen=True)
@@ -174,21 +174,12 @@ def common_planes(
         if noise is None:
             noises.append(sensor_noise(surfels, part, config, num_threads))
     known = SensorNoise.median(noises) if noise is None else noise
-    common = CommonPlanes(
-        rays.points,
-        rays.directions,
-        rays.ranges_m,
-        rays.scans,
-        planes,
-        poses[:, :3, 3] - rays.origin,
-        rays.up_of_scan,
-        np.concatenate(centres),
-        np.ascontiguousarray(np.concatenate(normals)),
-        grid.cell_m,
-        known.variances,
-        min(grid.window, _TOGETHER),
-        num_threads,
-    )
+    of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, planes
+    of_scans = poses[:, :3, 3] - rays.origin, rays.up_of_scan
+    of_planes = np.concatenate(centres), np.ascontiguousarray(np.concatenate(normals))
+    extent_m, together = grid.cell_m, min(grid.window, _TOGETHER)
+    noise_of_scan = known.of_scans(rays)
+    common = CommonPlanes(*of_rays, *of_scans, *of_planes, extent_m, noise_of_scan, together, num_threads)
     return common, known
 
 

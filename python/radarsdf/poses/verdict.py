@@ -54,12 +54,10 @@ class Verdict:
 
     @property
     def improved(self) -> bool:
-        """Whether the gain is significant."""
         return self.gain > self.needed
 
     @property
     def words(self) -> str:
-        """Summary in one sentence."""
         first, agree = "The given poses are kept", "do not agree"
         if self.improved:
             first, agree = "The refined poses make a sharper map", "agree"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from radarsdf.arrays import Array, Floats
+from radarsdf.checks import AnyPath
 from radarsdf.extras import require
 from radarsdf.grids.grid import Grid
 from radarsdf.io.files import write_whole
@@ -38,9 +38,7 @@ def png_of(figure: Any, **options: Any) -> bytes:
     return file.getvalue()
 
 
-def save_view_picture(
-    path: str | PathLike[str], views: Sequence[View], measured: Sequence[Array | None] = ()
-) -> None:
+def save_view_picture(path: AnyPath, views: Sequence[View], measured: Sequence[Array | None] = ()) -> None:
     """Save a PNG picture of views, one row each.
 
     The columns are the measured returns, if there are any, and the predicted ones, both as range over azimuth, and the
@@ -96,7 +94,7 @@ def _draw_returns(axes: Any, view: View, points: Array, values: Array | None, li
     return drawn
 
 
-def save_grid_picture(path: str | PathLike[str], grid: Grid, lower_m: float, upper_m: float) -> None:
+def save_grid_picture(path: AnyPath, grid: Grid, lower_m: float, upper_m: float) -> None:
     """Save a PNG picture of a grid from above. `lower_m`, `upper_m`: the heights of :meth:`Grid.flat`."""
     x, y, _ = grid.shape
     (x_m, y_m), size_m = grid.origin[:2], grid.voxel_size
@@ -129,7 +127,7 @@ def save_grid_picture(path: str | PathLike[str], grid: Grid, lower_m: float, upp
 
 
 def save_trajectory_picture(
-    path: str | PathLike[str], points: Sequence[Array], trajectories: Mapping[str, Floats]
+    path: AnyPath, points: Sequence[Array], trajectories: Mapping[str, Floats]
 ) -> None:
     """Save a PNG picture of trajectories from above, with the returns.
 

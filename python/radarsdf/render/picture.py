@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
-from radarsdf.checks import check, real_array
+from radarsdf.checks import AnyPath, check, real_array
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.figures import new_figure, png_of
@@ -105,7 +104,7 @@ def render(
 
 
 def save_picture(
-    path: str | PathLike[str],
+    path: AnyPath,
     mesh: trimesh.Trimesh,
     *,
     scalar: ArrayLike | None = None,

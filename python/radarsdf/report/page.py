@@ -6,12 +6,11 @@ import base64
 import functools
 import math
 import time
-from collections.abc import Callable
-from os import PathLike
 from typing import Any
 
 import jinja2
 
+from radarsdf.checks import AnyPath
 from radarsdf.extras import require
 from radarsdf.io.files import write_whole
 from radarsdf.view.pages import centre_of
@@ -25,7 +24,7 @@ def require_extras() -> None:
     require("matplotlib", "viser", what="a report needs")
 
 
-def write_page(path: str | PathLike[str], template: str, **values: Any) -> int:
+def write_page(path: AnyPath, template: str, **values: Any) -> int:
     """Fill a template and write the page atomically. Returns the size of the file, bytes."""
     made = time.strftime("%Y-%m-%d %H:%M")
     data = _environment().get_template(template).render(made=made, **values).encode()
@@ -39,33 +38,20 @@ def fixed(value: float, digits: int, unit: str = "") -> str:
 
 
 def percent(share: float) -> str:
-    """Format a share from 0 to 1 as a percentage."""
     return fixed(100 * share, 1, "%")
 
 
 def data_uri(image: bytes) -> str:
-    """Encode a PNG or JPEG file as a data URI."""
     kind = "png" if image.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
 
 
 @functools.cache
 def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("radarsdf.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    filters: dict[str, Callable[..., Any]] = {
-        "centre": centre_of,
-        "css_color": css_color,
-        "data_uri": data_uri,
-        "degrees": math.degrees,
-        "fixed": fixed,
-        "percent": percent,
-        "with_two_digits": lambda row: (row[0], *(fixed(value, 2) for value in row[1])),
-    }
-    environment.filters.update(filters)
+    loader = jinja2.PackageLoader("radarsdf.report")
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.undefined = jinja2.StrictUndefined
+    environment.filters |= {own.__name__: own for own in (css_color, data_uri, fixed, math.degrees, percent)}
+    environment.filters["centre"] = centre_of
+    environment.filters["with_two_digits"] = lambda row: (row[0], *(fixed(value, 2) for value in row[1]))
     return environment

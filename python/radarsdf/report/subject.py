@@ -45,9 +45,8 @@ class Subject:
     def mesh(self) -> Any:
         """The evaluated mesh, with intensities if the map has any."""
         viewpoint = self.viewpoint if self.radar_map.has_intensity else None
-        return self.radar_map.mesh(
-            self.voxel_size_m, box=self.box, viewpoint=viewpoint, progress=self.progress, **self.limits
-        )
+        limits: dict[str, Any] = {**self.limits, "box": self.box, "viewpoint": viewpoint}
+        return self.radar_map.mesh(self.voxel_size_m, progress=self.progress, **limits)
 
     @cached_property
     def shown(self) -> tuple[Any, float]:

@@ -13,10 +13,9 @@ from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.report.subject import Subject
-from radarsdf.view.framing import framing_pose
-from radarsdf.view.glb import glb
 from radarsdf.view.quantities import Scale
-from radarsdf.view.serving import free_port, set_initial_camera, start_server, stop_server
+from radarsdf.view.serving import framing_pose, free_port, set_initial_camera, start_server, stop_server
+from radarsdf.view.surface import glb
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
 _SCENE_ASPECT = 8 / 5  # aspect ratio of its frame on any screen, see the style in page.html
@@ -102,14 +101,9 @@ def scene(vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None 
         data = glb(np.round(vertices * _STEPS_PER_M) / _STEPS_PER_M, faces, colors)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
         if sensors is not None:
-            server.scene.add_point_cloud(
-                "/sensor",
-                sensors.astype(np.float32),
-                _SENSOR_COLOR,
-                point_size=0.008 * float(np.linalg.norm(pose.position - pose.look_at)),
-                point_shape="circle",
-                precision="float32",
-            )
+            size = 0.008 * float(np.linalg.norm(pose.position - pose.look_at))
+            style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
+            server.scene.add_point_cloud("/sensor", sensors.astype(np.float32), _SENSOR_COLOR, **style)
         set_initial_camera(server, pose)
         document: str = server.get_scene_serializer().as_html()
     finally:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from os import PathLike
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
+from radarsdf.checks import AnyPath
 from radarsdf.config.fit_config import FitConfig, flat_settings
 from radarsdf.config.toml import to_toml
 from radarsdf.report import plots
 from radarsdf.report.errors import error_values, intensity_values, uncertainty_values
 from radarsdf.report.page import fixed, require_extras, write_page
-from radarsdf.report.subject import Subject
-from radarsdf.report.surface import surface_values
+from radarsdf.report.subject import MAX_VERTICES, Subject
+from radarsdf.report.surface import scene, surface_values, views
+from radarsdf.view.pages import MEANING, centre_of
+from radarsdf.view.surface import thinned
 
 _COUNTS = {
     "tiles": "Tiles",
@@ -33,9 +36,10 @@ _DURATIONS = {
     "start_s": "Initial values, evidence of the cells",
     "training_s": "Training",
 }
+_MAX_LISTED = 50
 
 
-def write_report(path: str | PathLike[str], subject: Subject) -> int:
+def write_report(path: AnyPath, subject: Subject) -> int:
     """Write a self-contained HTML page about a map atomically, and return its size, bytes. Needs matplotlib and viser."""
     require_extras()
     report = subject.radar_map.report
@@ -88,3 +92,29 @@ def _training(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     for stage, done in report.get("iterations_done", {}).items():
         rows.append((f"Iterations, {stage}", f"{done:,} of {report['iterations'][stage]:,}"))
     return rows
+
+
+def write_changes_report(
+    path: AnyPath, changes: Changes, names: tuple[str, str], edge_m: float, regions: Sequence[Region]
+) -> int:
+    """Write a self-contained HTML page about changes atomically, and return its size, bytes.
+
+    `names`: of the earlier and the later map. `edge_m`: vertex spacing of their surfaces. `regions`: the changes to
+    list, largest first. Raises an ImportError if matplotlib or viser is missing, an OSError if the file cannot be written.
+    """
+    require_extras()
+    mesh: Any = thinned(changes.mesh(), MAX_VERTICES, edge_m)[0]
+    surface = None
+    if len(mesh.faces):
+        colors = colors_of(mesh.vertex_attributes["kind"])
+        vertices = np.asarray(mesh.vertices, np.float64)
+        local = vertices - vertices.mean(axis=0)
+        surface = {"scene": scene(local, mesh.faces, colors), "views": views(mesh, colors)}
+    rows = []
+    for number, region in enumerate(regions[:_MAX_LISTED], 1):
+        size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
+        numbers = fixed(region.area_m2, 2), fixed(region.probability, 2)
+        rows.append((number, region.words, centre_of(region), size, *numbers))
+    values = {"report": changes.report, "regions": regions, "rows": rows, "max_listed": _MAX_LISTED}
+    kinds = [NAMES[kind] for kind in CHANGED]
+    return write_page(path, "changes.html", names=names, surface=surface, key=MEANING, kinds=kinds, **values)

@@ -88,10 +88,9 @@ class ReturnsOfCells:
         parts = noise.weights(rays)
         ones: Floats32 = np.broadcast_to(np.float32(1), len(rays))
         ones = ones if parts is None else (parts / WEIGHT_UNIT).astype(np.float32)
-        weights, information = (
-            np.bincount(cells.cell_of_ray, values, len(cells.keys)).astype(np.float32)
-            for values in weights_of(ones, rays.ranges_m, noise)
-        )
+        of_rays = weights_of(ones, rays.ranges_m, noise)
+        sums = [np.bincount(cells.cell_of_ray, values, len(cells.keys)) for values in of_rays]
+        weights, information = (values.astype(np.float32) for values in sums)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m, len(cells.keys)) / cells.counts
         found = cls(cells.keys, weights, information, scans, cells.counts)
@@ -131,9 +130,7 @@ class VisibilityCounts:
         return np.append(self.scans, np.uint32(0))[rows]  # the last entry serves row -1, no block
 
 
-def evidence_sums(
-    returns: ReturnsOfCells, leaf_keys: Keys, num_threads: int = 0
-) -> tuple[Floats32, Counts32]:
+def evidence_sums(returns: ReturnsOfCells, leaf_keys: Keys, num_threads: int) -> tuple[Floats32, Counts32]:
     """Compute `information` and `hits` of :class:`Evidence`, (C,) each, for leaf cells with ascending keys (C,)."""
     blocks = CellBlocks(returns.keys)
     columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)

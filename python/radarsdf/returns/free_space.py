@@ -62,7 +62,6 @@ class FreeSpace:
         return cls(np.zeros(0, np.uint64), np.zeros((0, _PLANES, _WORDS), np.uint64))
 
     def check(self) -> None:
-        """Raise a ValueError if the arrays read from a file are inconsistent."""
         shaped = self.keys.ndim == 1 and self.planes.shape == (len(self.keys), _PLANES, _WORDS)
         fits = shaped and (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
         check(fits, "the free-space crossings are not planes of 512 cells for ascending keys")
@@ -72,7 +71,8 @@ class FreeSpace:
         first = np.asarray(lower, np.int64)
         last = first + np.asarray(shape)
         begin, end = first // BLOCK_CELLS, -(-last // BLOCK_CELLS)  # blocks that the box touches
-        blocks = block_numbers(self.keys)
+        # Block i begins at leaf cell 8 i.
+        blocks = lattice_of(self.keys << np.uint64(3 * _LEVELS)) // BLOCK_CELLS
         rows = np.flatnonzero(((blocks >= begin) & (blocks < end)).all(axis=1))
         whole = tuple((end - begin).tolist())
         found = np.zeros((*whole, BLOCK_CELLS, BLOCK_CELLS, BLOCK_CELLS), np.uint8)
@@ -91,11 +91,6 @@ class FreeSpace:
         words = self.planes[rows, :, bit >> np.uint64(6)] >> (bit & np.uint64(63))[:, None] & np.uint64(1)
         scans = (words[:, 0] + 2 * words[:, 1] + 4 * words[:, 2]).astype(np.uint8)
         return np.where(self.keys[rows] == blocks, scans, np.uint8(0))
-
-
-def block_numbers(keys: Keys) -> Ints:
-    """Return the block coordinates (B, 3) of `keys` (B,): block i begins at leaf cell 8 i."""
-    return lattice_of(keys << np.uint64(3 * _LEVELS)) // BLOCK_CELLS
 
 
 def unpacked(planes: Keys) -> Bytes:

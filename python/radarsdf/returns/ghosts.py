@@ -55,9 +55,8 @@ def find_ghosts(
     passed[surfels.cell_of_plane[flat]] = count(first, first >= 0, len(flat))
     # Ghosts lie behind surfaces that stop most rays.
     cells = surfels.cell_of_plane[flat]
-    passed_near = surfels.blocks.neighbour_sums(
-        surfels.keys[cells], passed[:, None], NEIGHBOUR_WEIGHT, num_threads
-    )[:, 0]
+    keys = surfels.keys[cells]
+    passed_near = surfels.blocks.neighbour_sums(keys, passed[:, None], NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     opaque = flat[surfels.support[cells] / (surfels.support[cells] + passed_near) > _MIN_OPACITY]
     behind, crossing = first >= 0, np.flatnonzero(first >= 0)
     crossed = first_crossed(surfels, opaque, rays.select(crossing), noise, num_threads, beyond_returns=False)
@@ -87,9 +86,8 @@ def _first_crossed_near_sample(
     follow(rows)
     blocks = surfels.keys[cell_of_ray] >> np.uint64(6)
     block = np.cumsum(np.diff(blocks, prepend=blocks[:1]) != 0)
-    counts, crossing = (
-        np.bincount(block[rows[of]], minlength=len(rays.keys)) for of in (slice(None), first[rows] >= 0)
-    )
+    counts = np.bincount(block[rows], minlength=len(rays.keys))
+    crossing = np.bincount(block[rows[first[rows] >= 0]], minlength=len(rays.keys))
     follow(np.flatnonzero(~sampled & ~((counts >= FEWEST_SAMPLED) & (crossing == 0))[block]))
     return first
 
@@ -111,18 +109,9 @@ def first_crossed(
     variances, centres, normals = (column.take(planes, axis=0) for column in columns)
     reach_m = np.full(len(planes), np.inf) if beyond_returns else _REACH_SIGMAS * np.sqrt(variances[:, 1])
     chosen = (centres, normals, np.sqrt(variances[:, :1]), reach_m[:, None])
-    surfel_map = SurfelMap(
-        surfels.keys[surfels.cell_of_plane[planes]],
-        np.concatenate(chosen, 1).astype(np.float32),
-        surfels.cell_size_m,
-    )
-    return surfel_map.first_crossings(
-        np.ascontiguousarray(rays.points),
-        np.ascontiguousarray(rays.directions),
-        np.ascontiguousarray(rays.ranges_m),
-        noise.range_m,
-        noise.angle_rad,
-        _MARGIN * surfels.cell_size_m,
-        _SIGMAS,
-        num_threads,
-    )
+    keys, of_planes = surfels.keys[surfels.cell_of_plane[planes]], np.concatenate(chosen, 1)
+    surfel_map = SurfelMap(keys, of_planes.astype(np.float32), surfels.cell_size_m)
+    limits = noise.range_m, noise.angle_rad, _MARGIN * surfels.cell_size_m, _SIGMAS
+    points, directions = np.ascontiguousarray(rays.points), np.ascontiguousarray(rays.directions)
+    of_rays = points, directions, np.ascontiguousarray(rays.ranges_m)
+    return surfel_map.first_crossings(*of_rays, *limits, num_threads)

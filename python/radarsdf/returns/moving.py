@@ -52,9 +52,7 @@ class SensorVelocity:
         return bool(np.isfinite(self.velocity_mps).all())
 
 
-def sensor_velocity(
-    points: Array, doppler_mps: Array, *, interval_mps: float | None = None
-) -> SensorVelocity:
+def sensor_velocity(points: Array, doppler_mps: Array, interval_mps: float | None = None) -> SensorVelocity:
     """Estimate the velocity of the sensor from a scan (N, 3) with `doppler_mps` (N,), positive away from the sensor.
 
     NaN with fewer than 10 returns, or if less than 40 % of them are inliers. An unobserved component is 0 m/s, with a standard
@@ -135,10 +133,8 @@ def sensor_velocities(
 ) -> list[SensorVelocity]:
     """Estimate the velocity in each of K scans of a sensor. `others_mps`: further speeds to find the ambiguity interval."""
     interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None
-    choices = [
-        [sensor_velocity(x, v, interval_mps=folded) for x, v in zip(points, doppler_mps, strict=True)]
-        for folded in ((None, interval) if interval else (None,))
-    ]
+    pairs, folds = list(zip(points, doppler_mps, strict=True)), (None, interval) if interval else (None,)
+    choices = [[sensor_velocity(x, v, folded) for x, v in pairs] for folded in folds]
     agreeing = [sum(int(velocity.static.sum()) for velocity in found) for found in choices]
     # Aliasing lets more returns agree by chance, so it must explain clearly more of them.
     return choices[-1] if agreeing[-1] > 1.2 * agreeing[0] else choices[0]
@@ -253,10 +249,8 @@ class StaticReturns:
 
 def checked_doppler(scans: list[Array], doppler_mps: Sequence[ArrayLike]) -> list[Array]:
     """Return F arrays (N_i,). Raise a TypeError or ValueError if they are not numbers or do not match the scans."""
-    speeds = [
-        real_array(values, f"doppler_mps of scan {i}")
-        for i, values in enumerate(one_for_each_scan(doppler_mps, "doppler_mps"))
-    ]
+    each = enumerate(one_for_each_scan(doppler_mps, "doppler_mps"))
+    speeds = [real_array(values, f"doppler_mps of scan {i}") for i, values in each]
     check_values_of_scans(speeds, scans, "doppler_mps")
     return speeds
 

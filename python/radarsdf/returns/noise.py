@@ -225,18 +225,11 @@ def onto_surfels(
     surface, which is that of the returns minus their mean σ². This is the best linear estimate of its true
     distance (Wiener, 1949). Along the plane, the return keeps its position.
     """
-    points, directions, ranges_m = move_onto_planes(
-        *rays.in_c_order(),
-        np.ascontiguousarray(rays.scans),
-        rays.up_of_scan,
-        surfels.flat_planes_of(cells),
-        surfels.centres,
-        surfels.normals,
-        np.ascontiguousarray(surfels.variances[:, 0]),
-        noise.of_scans(rays),
-        kept,
-        num_threads,
-    )
+    of_rays = *rays.in_c_order(), np.ascontiguousarray(rays.scans), rays.up_of_scan
+    thickness = np.ascontiguousarray(surfels.variances[:, 0])
+    planes = surfels.flat_planes_of(cells), surfels.centres, surfels.normals, thickness
+    moved_onto = move_onto_planes(*of_rays, *planes, noise.of_scans(rays), kept, num_threads)
+    points, directions, ranges_m = moved_onto
     moved = dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)
     if kept is None:
         return moved

@@ -62,9 +62,7 @@ class Radars:
         for label, noise, unit, rows in each:
             if len(own := rays.select(rows)):
                 sensor, (gain, offset) = Sensor.of_rays(own, poses, noise), unit or (1.0, 0.0)
-                thresholds = tuple(
-                    (range_m, gain * weakest + offset) for range_m, weakest in sensor.thresholds
-                )
+                thresholds = tuple((range_m, gain * low + offset) for range_m, low in sensor.thresholds)
                 found[label] = dataclasses.replace(sensor, thresholds=thresholds, unit=(gain, offset))
         return found
 

@@ -11,18 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf import checks
 from radarsdf._core import hash_rays, scan_rays
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Keys
-from radarsdf.checks import (
-    MAX_POSITION_M,
-    check,
-    check_scan_shape,
-    check_scan_shapes,
-    check_values_of_scans,
-    one_for_each_scan,
-    real_array,
-    usable_poses,
-)
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
@@ -83,7 +74,6 @@ class Rays:
         return hash_rays(directions, ranges_m, intensities, num_threads)
 
     def without_outliers(self) -> Rays:
-        """Replace intensity outliers by NaN."""
         if self.intensities is None:
             return self
         kept, keys = self.intensities.copy(), self.hashes()
@@ -114,9 +104,9 @@ class Rays:
 def measured(scan: Array) -> Bools:
     """Return a mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor, not padding."""
     returns = np.ones(len(scan), np.bool_)
-    if not (scan.all() and np.abs(scan).max(initial=0.0) <= MAX_POSITION_M):
+    if not (scan.all() and np.abs(scan).max(initial=0.0) <= checks.MAX_POSITION_M):
         # By column: NumPy takes ten times as long along rows of three.
-        finite, other = np.abs(scan) <= MAX_POSITION_M, scan != 0
+        finite, other = np.abs(scan) <= checks.MAX_POSITION_M, scan != 0
         returns = finite[:, 0] & finite[:, 1] & finite[:, 2]
         returns &= other[:, 0] | other[:, 1] | other[:, 2]
     # Drivers pad a cloud of fixed size with one point: a long run of equal rows among other rows.
@@ -178,9 +168,9 @@ def check_scans(
     Rows that are not returns, or too far, become 0 0 0 and non-finite intensities NaN, so that the arrays keep their length.
     """
     scans, left_out = [], LeftOut()
-    for i, given in enumerate(one_for_each_scan(points, "points")):
-        scan = real_array(given, f"scan {i}")
-        check_scan_shape(scan, i)
+    for i, given in enumerate(checks.one_for_each_scan(points, "points")):
+        scan = checks.real_array(given, f"scan {i}")
+        checks.check_scan_shape(scan, i)
         returns = measured(scan)
         far = too_far(scan, returns)
         returns &= ~far
@@ -191,14 +181,12 @@ def check_scans(
         if num_rows == len(scan):
             left_out.empty.append(i)
         scans.append(np.where(returns[:, None], scan, 0.0) if num_rows else scan)
-    check_scan_shapes(scans)
+    checks.check_scan_shapes(scans)
     if intensities is None:
         return scans, None, left_out
-    values = [
-        real_array(of_scan, f"intensities of scan {i}", np.float32)
-        for i, of_scan in enumerate(one_for_each_scan(intensities, "intensities"))
-    ]
-    check_values_of_scans(values, scans, "intensities")
+    each = enumerate(checks.one_for_each_scan(intensities, "intensities"))
+    values = [checks.real_array(of_scan, f"intensities of scan {i}", np.float32) for i, of_scan in each]
+    checks.check_values_of_scans(values, scans, "intensities")
     return scans, [np.where(np.isfinite(v), v, np.float32(np.nan)) for v in values], left_out
 
 
@@ -247,14 +235,14 @@ def prepare(
     not rigid, intensities are all equal or too far apart for float32, or no return is within the ranges.
     """
     mixed = rig is not None and len(rig.labels) > 1 and accumulate_scans > 1
-    check(not mixed, f"accumulate_scans must be 1 for several radars, not {accumulate_scans}")
+    checks.check(not mixed, f"accumulate_scans must be 1 for several radars, not {accumulate_scans}")
     scans, values, left_out = check_scans(points, intensities)
     num_scans = len(scans)
-    T_world_sensor, rigid = usable_poses(poses, num_scans)
+    T_world_sensor, rigid = checks.usable_poses(poses, num_scans)
     left_out.poses = np.flatnonzero(~rigid).tolist()
     positions = T_world_sensor[:, :3, 3]
     if origin is not None:
-        local_origin = check_positions(real_array(origin, "origin")[None], "origin")[0]
+        local_origin = check_positions(checks.real_array(origin, "origin")[None], "origin")[0]
     else:
         local_origin = positions.mean(axis=0)
         if lattice is not None:
@@ -273,31 +261,23 @@ def prepare(
     for note in left_out.notes if whole else ():
         _LOG.warning(note)
     intensity = None if values is None else np.concatenate(values)[kept]
-    rays = Rays(
-        origin=local_origin,
-        points=points_m,
-        directions=directions,
-        ranges_m=ranges_m,
-        intensities=intensity,
-        scans=scan_of[kept],
-        up_of_scan=T_world_sensor[:, :3, 2].copy(),
-        num_given=left_out.given,
-        sensor_of_scan=None if rig is None else rig.of_scan,
-        num_sensors=1 if rig is None else len(rig.labels),
-    )
+    columns = local_origin, points_m, directions, ranges_m, intensity, scan_of[kept]
+    rays = Rays(*columns, T_world_sensor[:, :3, 2].copy(), left_out.given)
+    if rig is not None:
+        rays = dataclasses.replace(rays, sensor_of_scan=rig.of_scan, num_sensors=len(rig.labels))
     rays = rays.without_outliers() if whole else rays
     if rays.intensities is not None and whole:
         fits = rays.with_intensity.any()
-        check(fits, "no intensity is finite: omit intensities if the sensor does not measure them")
+        checks.check(fits, "no intensity is finite: omit intensities if the sensor does not measure them")
         check_range(float(np.nanmin(rays.intensities)), float(np.nanmax(rays.intensities)))
     return rays
 
 
 def check_range(low: float, high: float) -> None:
     """Raise a ValueError if intensities from `low` to `high`, sensor units, are all equal or too far apart for float32."""
-    check(low != high, f"all intensities are {low}: omit them if the sensor does not measure them")
+    checks.check(low != high, f"all intensities are {low}: omit them if the sensor does not measure them")
     fits = high - low <= float(np.finfo(np.float32).max)
-    check(fits, f"intensities from {low} to {high} are too far apart for float32")
+    checks.check(fits, f"intensities from {low} to {high} are too far apart for float32")
 
 
 def rays_from(
@@ -312,13 +292,6 @@ def rays_from(
     """Build rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest as in :class:`Rays`."""
     away = points - sensors
     ranges_m = np.maximum(_lengths(away), 1e-6)
-    return Rays(
-        origin=origin,
-        points=points.astype(np.float32, copy=False),
-        directions=(away / ranges_m[:, None]).astype(np.float32),
-        ranges_m=ranges_m.astype(np.float32),
-        intensities=intensities,
-        scans=scans,
-        up_of_scan=up_of_scan,
-        num_given=len(points),
-    )
+    directions = (away / ranges_m[:, None]).astype(np.float32)
+    columns = points.astype(np.float32, copy=False), directions, ranges_m.astype(np.float32)
+    return Rays(origin, *columns, intensities, scans, up_of_scan, len(points))

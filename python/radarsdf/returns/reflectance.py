@@ -75,7 +75,6 @@ class Reflectance:
         return CellMeans(_in_metres(_KINDS, self.leaf_size_m), _TILINGS, self.mean_keys, means)
 
     def check(self) -> None:
-        """Raise a ValueError if keys are not ascending, or shapes do not match."""
         shapes = self.coefficients.shape, self.table.shape, self.normals.shape
         fits = shapes == ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3))
         check(fits, "the reflectance has arrays of wrong shapes")
@@ -119,16 +118,10 @@ class Reflectance:
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
         coefficients = response.coefficients.copy()
         coefficients[:, 0] += np.median(left - groups.of_returns(explained))
-        return cls(
-            leaf_size_m,
-            times * coefficients,
-            np.float32(times) * response.table,
-            surfels.keys[surfels.cell_of_plane[flat]],
-            normals[flat],
-            keys,
-            (np.float32(times) * means).astype(np.float16),
-            share,
-        )
+        table, means = np.float32(times) * response.table, np.float32(times) * means
+        plane_keys = surfels.keys[surfels.cell_of_plane[flat]]
+        of_planes = times * coefficients, table, plane_keys, normals[flat]
+        return cls(leaf_size_m, *of_planes, keys, means.astype(np.float16), share)
 
     def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
         """See :meth:`~radarsdf.returns.response.Response.measured`."""

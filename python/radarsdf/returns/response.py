@@ -164,9 +164,8 @@ def regression(design: Floats, values: Floats) -> Floats:
     ridge = np.eye(design.shape[1]) * (1e-3 * np.sqrt(len(values)) + 1e-6 * float((design**2).sum()))
     for _ in range(_REWEIGHTINGS):
         weighted = design * weights[:, None]
-        coefficients: Floats = np.linalg.solve(
-            normal_matrix(design, weighted) + ridge, normal_matrix(weighted, values[:, None])[:, 0]
-        )
+        right = normal_matrix(weighted, values[:, None])[:, 0]
+        coefficients: Floats = np.linalg.solve(normal_matrix(design, weighted) + ridge, right)
         error = np.abs(values - product(design, coefficients[:, None])[:, 0])
         weights = 1 / np.maximum(1, error / max(float(np.median(error)), 1e-9))
     return coefficients

@@ -98,7 +98,6 @@ class ViewStatistics:
         return cls(empty, empty.astype(np.int8), none.astype(np.float16), none, none.astype(np.int16), 0.0)
 
     def check(self, leaf_size_m: float) -> None:
-        """Raise a ValueError if the arrays read from a file are inconsistent."""
         count, limit_m = len(self.counts), MAX_CELLS_FROM_ORIGIN * leaf_size_m
         shapes = [getattr(self, name).shape for name in _COLUMNS]
         fits = shapes == [(count, 3), (count, 3), (count,), (count,), (count,)]

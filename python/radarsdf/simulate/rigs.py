@@ -111,15 +111,12 @@ def simulate_rig(
         simulations[label] = simulate(scene, radar.sensor, T_world_sensor[rows], name=str(label), seed=own)
         doppler_mps += measured_doppler(simulations[label].points, velocities[rows], radar.interval_mps, own)
     stamps_s = true_s + np.array([radar.time_offset_s for radar in radars.values()])[rig.of_scan]
-    scans = Scans(
-        [points for simulation in simulations.values() for points in simulation.points],
-        body,
-        [values for simulation in simulations.values() for values in simulation.intensities],
-        doppler_mps=doppler_mps,
-        times_s=stamps_s,
-        sensors=labels,
-        T_body_sensor=mounted,
-    ).select(np.argsort(stamps_s, kind="stable"))
+    each = [*simulations.values()]
+    points = [scan for own in each for scan in own.points]
+    values = [scan for own in each for scan in own.intensities]
+    of_radars: dict[str, Any] = {"sensors": labels, "T_body_sensor": mounted}
+    scans = Scans(points, body, values, doppler_mps=doppler_mps, times_s=stamps_s, **of_radars)
+    scans = scans.select(np.argsort(stamps_s, kind="stable"))
     lidars = [simulation.lidar for simulation in simulations.values()]
 
     def truth() -> Floats:

@@ -73,7 +73,6 @@ class Site:
         return self._block(xy, yaw + self.rng.normal(0, 0.05), size, vary(self.rng, materials.TREE))
 
     def car(self, xy: Floats, yaw: float) -> bool:
-        """Add a car of two boxes: the body, and the cabin on top."""
         metal = vary(self.rng, materials.METAL)
         yaw, size = yaw + self.rng.normal(0, 0.05), self.rng.uniform([3.9, 1.7, 0.8], [4.8, 1.9, 1.0])
         if not self._block(xy, yaw, size, metal):

@@ -129,15 +129,7 @@ def simulate(scene: Scene, sensor: RadarSensor, poses: Floats, *, name: str, see
     instance(sensor, RadarSensor, "sensor")
     poses = check_poses(poses)
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
-    return Simulation(
-        points=[scan.points for scan in scans],
-        poses=poses,
-        intensities=[scan.intensities for scan in scans],
-        noiseless_intensities=[scan.noiseless_intensities for scan in scans],
-        origin_kind=[scan.origin_kind for scan in scans],
-        scene=scene,
-        sensor=sensor,
-        name=name,
-        seed=seed,
-        lidar=Lidar(scene, sensor, poses.copy(), seed),
-    )
+    columns = ("points", "intensities", "noiseless_intensities", "origin_kind")
+    of_scans = {column: [getattr(scan, column) for scan in scans] for column in columns}
+    lidar = Lidar(scene, sensor, poses.copy(), seed)
+    return Simulation(poses=poses, scene=scene, sensor=sensor, name=name, seed=seed, lidar=lidar, **of_scans)

@@ -6,14 +6,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
-from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
-from radarsdf.checks import check, positive
+from radarsdf.checks import AnyPath, check, positive
 from radarsdf.map import queries, storage
 from radarsdf.map.confidence import EvidenceAt, evidence
 from radarsdf.map.contents import MapContents
@@ -38,7 +37,7 @@ class Share(NamedTuple):
 class TileBlend(Map):
     """Queries of :class:`TiledMap`: weighted averages of the tiles that know a position."""
 
-    def __init__(self, folder: str | PathLike[str], *, memory_bytes: float = _MEMORY_BYTES) -> None:
+    def __init__(self, folder: AnyPath, *, memory_bytes: float = _MEMORY_BYTES) -> None:
         self.folder = Path(folder)
         self.plan = Plan.load(self.folder)
         self.memory_bytes = positive(memory_bytes, "memory_bytes")
@@ -59,7 +58,6 @@ class TileBlend(Map):
 
     @cached_property
     def done(self) -> set[Tile]:
-        """Indices of the tiles that are done."""
         return {tile.tile for tile in self.tiles}
 
     @cached_property

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from radarsdf.checks import check, hides_bar, instance, path_of, positive
+from radarsdf.checks import AnyPath, check, hides_bar, instance, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.extras import require
 from radarsdf.fitting.steps import FitInput, fit_rays
@@ -38,8 +38,8 @@ _OURS = {PLAN, _LOCK, TILES, SCANS_FILE}
 
 
 def fit_tiles(
-    scans: str | PathLike[str] | Scans | Iterable[Scan],
-    out: str | PathLike[str],
+    scans: AnyPath | Scans | Iterable[Scan],
+    out: AnyPath,
     *,
     tile_size: float | None = None,
     halo: float | None = None,
@@ -87,8 +87,8 @@ def fit_tiles(
 
 
 def plan_tiles(
-    scans: str | PathLike[str] | Scans | Iterable[Scan],
-    out: str | PathLike[str],
+    scans: AnyPath | Scans | Iterable[Scan],
+    out: AnyPath,
     *,
     tile_size: float | None = None,
     halo: float | None = None,
@@ -135,7 +135,7 @@ def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: ScanStre
 
 
 def run_fits(
-    folder: str | PathLike[str],
+    folder: AnyPath,
     *,
     executor: Executor | None = None,
     names: Iterable[str] | None = None,
@@ -170,15 +170,9 @@ def fit_tile(folder: str, name: str) -> None:
     def read() -> FitInput:
         rays, inside = read_rays(root, plan, tile)
         limits = plan.intensity_range
-        return FitInput(
-            rays,
-            None if limits is None else IntensityScale.between(limits),
-            inside=inside,
-            clutter_ratio=plan.clutter_ratio,
-            returns_per_cell=plan.returns_per_cell,
-            sensor=plan.sensor,
-            box_cells=plan.box_cells(tile.tile),
-        )
+        scale = None if limits is None else IntensityScale.between(limits)
+        of_plan = {name: getattr(plan, name) for name in ("clutter_ratio", "returns_per_cell", "sensor")}
+        return FitInput(rays, scale, inside=inside, box_cells=plan.box_cells(tile.tile), **of_plan)
 
     radar_map = fit_rays(read, plan.config, progress=False)
     radar_map.report["plan"] = plan.digest_of(tile)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from os import PathLike
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
-from radarsdf.checks import check, check_box, hides_bar, path_of, positive
-from radarsdf.io.files import check_outputs, checked_suffix, reading
+from radarsdf.checks import AnyPath, check, check_box, hides_bar, path_of, positive
+from radarsdf.io.files import check_outputs, checked_suffix, reading, write_whole
+from radarsdf.io.glb import MATT, T_GLTF_WORLD, encode_glb
 from radarsdf.io.meshes import MESH_SUFFIXES, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
@@ -26,10 +29,6 @@ from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import Tile, folder_of, neighbours
-from radarsdf.tiles.tileset import content_folder, write_tileset
-
-if TYPE_CHECKING:
-    import trimesh
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
@@ -75,7 +74,7 @@ def parts_of(
         key = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         path = folder_of(city.folder, planned.tile) / f"mesh-{key}.npz"
         if not path.is_file():
-            surface, leaf_cells = _surface_in(city, planned.tile, steps, corners)
+            surface, leaf_cells = _surface(city, planned.tile, steps, corners)
             arrays = {name: value for name, value in vars(surface).items() if name in _ARRAYS}
             counts = np.array([leaf_cells, surface.cells_searched])
             write_arrays(path, arrays | {"cells": counts, "tally": surface.tally.sums()})
@@ -84,9 +83,7 @@ def parts_of(
     return paths, limits, Tally.of_sums(tally)
 
 
-def _surface_in(
-    city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = None
-) -> tuple[Surface, int]:
+def _surface(city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = None) -> tuple[Surface, int]:
     """Surface in the leaf cells of a tile, world, m, with `steps` voxels along a cell's edge, and the number of the cells."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
@@ -150,7 +147,7 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted:
 
 
 def export_mesh(
-    city: TileBlend, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
+    city: TileBlend, path: AnyPath, voxel_size: float, progress: bool | None, **limits: Any
 ) -> tuple[int, int]:
     """See :meth:`TiledMap.export`. Unwritable paths are detected before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
@@ -187,7 +184,7 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(city.plan.origin_cells(tiles[0]))
-    surfaces = [_surface_in(city, tile)[0] for tile in tiles]
+    surfaces = [_surface(city, tile)[0] for tile in tiles]
     vertices, faces = _welded(city, [one.vertices for one in surfaces], [one.faces for one in surfaces])
     used, faces = renumbered(len(vertices), faces)
 
@@ -202,3 +199,60 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     surface = Surface.from_triangles(city.contents_of_any, local, faces, evidence(local), cells)
     predicted = intensity if city.has_intensity else None
     return ViewedMap.of_surface(surface, city.contents_of_any, origin, evidence, predicted)
+
+
+# Viewers open a node when its error exceeds about 16 pixels: here, at less than about three times its edge.
+_ERROR_OF_EDGE = 1 / 16
+_GREY = MATT["pbrMetallicRoughness"] | {"baseColorFactor": [0.784, 0.784, 0.784, 1.0]}
+
+
+def content_folder(path: Path) -> Path:
+    """Folder of the GLB files of ``NAME.json``. Raises an OSError if one of the two cannot be written."""
+    check_outputs([path])
+    folder = path.with_suffix("")
+    folder.mkdir(exist_ok=True)
+    check_outputs([folder / "0_0.glb"])
+    return folder
+
+
+def write_tileset(city: TileBlend, path: Path, meshes: Iterable[tuple[Floats, Ints32]]) -> tuple[int, int]:
+    """Write ``NAME.json`` and a GLB file per tile with triangles. Returns the numbers of vertices and triangles.
+
+    `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. GLB files hold float32 relative to the origin of the
+    tile, which is float64 in the JSON: precision does not depend on the distance from the world's origin.
+    """
+    folder = content_folder(path)
+    children, corners, count = [], [], np.zeros(2, np.int64)
+    for planned, (vertices, faces) in zip(city.tiles, meshes, strict=True):
+        if len(faces) == 0:
+            continue
+        name, origin = f"{planned.name}.glb", city.config.lattice.position(planned.origin_cells)
+        local = vertices - origin
+        normals = {"NORMAL": trimesh.Trimesh(local, faces, process=False).vertex_normals}
+        # Viewers turn y up into z up, which 3D Tiles have.
+        material = MATT | {"pbrMetallicRoughness": _GREY}
+        data = encode_glb(local, faces, normals, material=material, matrix=T_GLTF_WORLD)
+        write_whole(folder / name, data)
+        T_world_tile = np.eye(4)
+        T_world_tile[:3, 3] = origin
+        child: dict[str, Any] = {"boundingVolume": _box(local), "geometricError": 0.0}
+        child["content"] = {"uri": quote(f"{folder.name}/{name}")}
+        child["transform"] = T_world_tile.T.ravel().tolist()  # column-major
+        children.append(child)
+        corners += [vertices.min(axis=0), vertices.max(axis=0)]
+        count += len(vertices), len(faces)
+    check(children, "no tile has a triangle, so there is nothing to write")
+    error_m = float(np.ptp(corners, axis=0).max()) * _ERROR_OF_EDGE
+    root = {"boundingVolume": _box(np.array(corners)), "geometricError": error_m}
+    root |= {"refine": "ADD", "children": children}
+    # The JSON is last, so that all files it names exist.
+    described = {"asset": {"version": "1.1"}, "geometricError": error_m, "root": root}
+    write_whole(path, json.dumps(described, allow_nan=False).encode())
+    num_vertices, num_faces = count.tolist()
+    return num_vertices, num_faces
+
+
+def _box(points: Floats) -> dict[str, Any]:
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    half = np.maximum((upper - lower) / 2, 1e-3)  # a flat box would have no volume
+    return {"box": [*((lower + upper) / 2).tolist(), *np.diag(half).ravel().tolist()]}

@@ -193,23 +193,19 @@ class Plan:
             described = by_name(json.loads(content), "the plan")
             check({name: described.pop(name, None) for name in FORMAT} == FORMAT, f"it is not of {FORMAT}")
             described.pop("crc32")
-            plan = cls(
-                config=FitConfig.from_dict(described.pop("config")),
-                sensor=Sensor.from_dict(described.pop("sensor")),
-                tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
-                **described,
-            )
+            config = FitConfig.from_dict(described.pop("config"))
+            sensor = Sensor.from_dict(described.pop("sensor"))
+            tiles = tuple(TilePlan(**planned) for planned in described.pop("tiles"))
+            plan = cls(config=config, sensor=sensor, tiles=tiles, **described)
             check(plan._file_bytes() == content, "its checksum is wrong")
             return plan
 
 
 def folder_of(folder: Path, tile: Tile) -> Path:
-    """Folder of the files of a tile."""
     return folder / TILES / f"{tile[0]}_{tile[1]}"
 
 
 def map_path(folder: Path, tile: TilePlan) -> Path:
-    """File of the map of a tile."""
     return folder_of(folder, tile.tile) / "map.safetensors"
 
 

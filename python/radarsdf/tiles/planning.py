@@ -151,12 +151,11 @@ class _Planner:
 
     def _rays(self, scans: list[Scan], first: int) -> Rays:
         """Prepare the static returns, checked, in a frame of their own."""
-        held, given = scans_in_memory(scans), self._config.preparation
+        held, config = scans_in_memory(scans), self._config
         try:
-            static = StaticReturns.of(
-                held.points, held.intensities, held.doppler_mps, self._config.returns, held.rig
-            )
-            return prepare(static.points, held.poses, static.intensities, whole=False, **given)
+            given = held.points, held.intensities, held.doppler_mps
+            static = StaticReturns.of(*given, config.returns, held.rig)
+            return prepare(static.points, held.poses, static.intensities, whole=False, **config.preparation)
         except (ValueError, TypeError) as error:
             msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
             raise ValueError(msg) from error
@@ -221,28 +220,24 @@ class _Planner:
             in_cells += float(surfels.counts[held].sum())
             cells += len(held)
         noise = SensorNoise.median(noises)
+        of_cells: dict[str, Any] = {
+            "clutter_ratio": clutter / returns,
+            "returns_per_cell": in_cells / max(cells, 1),
+        }
+        config = plan.config.override(returns=noise.settings)
+        tiles = sorted(tiles, key=lambda tile: tile.tile)
         return dataclasses.replace(
-            plan,
-            config=plan.config.override(returns=noise.settings),
-            clutter_ratio=clutter / returns,
-            returns_per_cell=in_cells / max(cells, 1),
-            sensor=self._sensor(noise),
-            tiles=tuple(sorted(tiles, key=lambda tile: tile.tile)),
+            plan, config=config, sensor=self._sensor(noise), tiles=tuple(tiles), **of_cells
         )
 
     def _sensor(self, noise: SensorNoise) -> Sensor:
-        limits = self._config.returns
-        return Sensor.of(
-            [scan.points for _, scan in self._samples],
-            [scan.intensities for _, scan in self._samples if scan.intensities is not None] or None,
-            noise=noise,
-            min_range_m=limits.min_range_m,
-            max_range_m=limits.max_range_m,
-        )
+        points = [scan.points for _, scan in self._samples]
+        values = [scan.intensities for _, scan in self._samples if scan.intensities is not None] or None
+        limits = {name: getattr(self._config.returns, name) for name in ("min_range_m", "max_range_m")}
+        return Sensor.of(points, values, noise=noise, **limits)
 
 
 def rays_path(folder: Path, tile: Tile) -> Path:
-    """File of the rays of a tile."""
     return folder_of(folder, tile) / "rays.bin"
 
 
@@ -260,14 +255,9 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     if plan.intensity_range is not None:
         intensities = Plausible(*plan.intensity_range).kept(rows["intensity"])
     origin = plan.config.lattice.position(tile.origin_cells)
-    rays = rays_from(
-        points,
-        (of_scans[:, :3] - origin)[scans],
-        origin=origin,
-        intensities=intensities,
-        scans=scans.astype(np.int32),
-        up_of_scan=np.ascontiguousarray(of_scans[:, 3:]),
-    )
+    positions, up = (of_scans[:, :3] - origin)[scans], np.ascontiguousarray(of_scans[:, 3:])
+    of_rays: dict[str, Any] = {"origin": origin, "intensities": intensities, "scans": scans.astype(np.int32)}
+    rays = rays_from(points, positions, up_of_scan=up, **of_rays)
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
     halo = round(plan.halo_m / plan.config.leaf_size_m)
     lower = np.array(tile.tile) * plan.tile_cells - plan.origin_cells(tile.tile)[:2] - halo

@@ -5,13 +5,12 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from functools import cached_property, partial
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import path_of
+from radarsdf.checks import AnyPath, path_of
 from radarsdf.map import storage
 from radarsdf.map.free_space import CellsInBox, dense_cells
 from radarsdf.map.map import Map
@@ -105,12 +104,7 @@ class TiledMap(TileBlend):
         return self._viewed[1]
 
     def export(
-        self,
-        path: str | PathLike[str],
-        voxel_size: float = VOXEL_M,
-        *,
-        progress: bool | None = None,
-        **limits: Any,
+        self, path: AnyPath, voxel_size: float = VOXEL_M, *, progress: bool | None = None, **limits: Any
     ) -> tuple[int, int]:
         """Write the mesh to one file, or as 3D Tiles, with one tile at a time in memory.
 
@@ -149,7 +143,7 @@ class TiledMap(TileBlend):
         _, wanted, tally = parts_of(self, voxel_size, progress, **limits)
         return tally.threshold(wanted.min_confidence)
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Copy the plan and the maps of finished tiles, without their rays, to a new folder for :func:`radarsdf.load`.
 
         Raises an OSError if the folder exists, or cannot be written.
@@ -202,7 +196,7 @@ class TiledMap(TileBlend):
         return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
 
-def load(path: str | PathLike[str]) -> Map:
+def load(path: AnyPath) -> Map:
     """Load a map from a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
 
     Parameters

@@ -10,12 +10,10 @@ import numpy as np
 from radarsdf.arrays import Floats
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
 from radarsdf.checks import check
-from radarsdf.view.framing import framing_pose
-from radarsdf.view.glb import glb, lightness_of, shaded
 from radarsdf.view.quantities import key, paragraph, table
 from radarsdf.view.scene import add_path
-from radarsdf.view.serving import Page, set_initial_camera
-from radarsdf.view.surface import thinned
+from radarsdf.view.serving import Page, framing_pose, set_initial_camera
+from radarsdf.view.surface import glb, lightness_of, shaded, thinned
 
 if TYPE_CHECKING:
     import trimesh
@@ -30,7 +28,6 @@ MEANING = {name + _NOTES.get(name, ""): color for name, color in _NAMED_COLORS}
 
 
 def centre_of(region: Region) -> str:
-    """Format the centre of a change, world frame."""
     return "({:.1f}, {:.1f}, {:.1f}) m".format(*region.box.mean(axis=0))
 
 

@@ -45,8 +45,6 @@ class Scale:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A scalar per vertex."""
-
     label: str  # name and unit
     values: Callable[[Ints, Position], Array]  # (N,) of vertices (N,), for a sensor at a position
     scale: Scale
@@ -80,14 +78,11 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
 
 
 def legend(quantity: Quantity) -> str:
-    """Format the colour scale of a quantity as HTML."""
     scale = quantity.scale
     bar = f"height:0.8em;border-radius:0.2em;background:linear-gradient(to right,{scale.css})"
     ends = "display:flex;justify-content:space-between;font-variant-numeric:tabular-nums"
-    return _block(
-        f'<div>{quantity.label}</div><div style="{bar}"></div>'
-        f'<div style="{ends}"><span>{scale.low:.3g}</span><span>{scale.high:.3g}</span></div>'
-    )
+    limits = f"<span>{scale.low:.3g}</span><span>{scale.high:.3g}</span>"
+    return _block(f'<div>{quantity.label}</div><div style="{bar}"></div><div style="{ends}">{limits}</div>')
 
 
 def key(colors: Mapping[str, Color | Scale]) -> str:
@@ -101,20 +96,16 @@ def key(colors: Mapping[str, Color | Scale]) -> str:
         else:
             background = css_color(color)
         mark = f"flex:none;width:0.8em;height:0.8em;border-radius:0.2em;background:{background}"
-        rows.append(
-            '<div style="display:flex;align-items:center;gap:0.5em">'
-            f'<i style="{mark}"></i><span>{escape(name)}{limits}</span></div>'
-        )
+        words = f'<i style="{mark}"></i><span>{escape(name)}{limits}</span>'
+        rows.append(f'<div style="display:flex;align-items:center;gap:0.5em">{words}</div>')
     return _block("".join(rows))
 
 
 def paragraph(text: str) -> str:
-    """Format a text as HTML."""
     return _block(escape(text))
 
 
 def table(rows: Mapping[str, str]) -> str:
-    """Format names and values as an HTML table."""
     cells = (f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows.items())
     return _block(f'<table style="border-spacing:0.6em 0">{"".join(cells)}</table>')
 
@@ -124,5 +115,4 @@ def _block(html: str) -> str:
 
 
 def css_color(color: Sequence[int]) -> str:
-    """Format an sRGB colour, 0 to 255, as CSS."""
     return "rgb({} {} {})".format(*color)

@@ -1,30 +1,42 @@
-"""Server of a page and its address. The only module that imports viser."""
+"""Server of a page and its address. The only module that imports viser.
+
+It refuses requests from other web pages in the same browser, which could reach this machine, even by DNS rebinding. Browsers report
+the requested name as `Host`, and the requesting page as `Origin`.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import gc
+import importlib
 import io
 import ipaddress
+import math
 import os
 import socket
 import sys
 import time
 import warnings
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import urlsplit
 
+import numpy as np
+
+from radarsdf.arrays import Floats
 from radarsdf.checks import whole_number
 from radarsdf.extras import require
-from radarsdf.view.framing import FOV_RAD, CameraPose
-from radarsdf.view.guarding import guarded
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 _FIRST_PORT, _PORTS_TRIED = 8080, 100
 WAIT_STEP_S = 0.2  # step of waits in the main thread: on Windows, Ctrl-C does not interrupt an endless wait
+FOV_RAD = 0.85  # vertical field of view: less than viser's, so that walls stay upright
+ASPECT = 1.3  # width over height of a page's frame, until the page reports its own
+_TO_EYE = np.array([-0.33, -0.57, 0.5])
+_MARGIN = 1.08
 
 
 def require_viser() -> None:
@@ -50,6 +62,51 @@ def free_port(host: str, port: int | None) -> int:
     raise OSError(msg)
 
 
+def refusal(hosts: Sequence[str], origins: Sequence[str], listening: str) -> str | None:
+    """Reason to refuse a request with these ``Host`` and ``Origin`` headers by a server on `listening`; None to accept it."""
+    if len(hosts) != 1 or not _is_this_machine(hosts[0], listening.lower()):
+        return "the Host of the request is not this server"
+    own = {f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")}
+    if len(origins) > 1 or not own.issuperset(origin.lower() for origin in origins):
+        return "the Origin of the request is another page"
+    return None
+
+
+def _is_this_machine(host: str, listening: str) -> bool:
+    with contextlib.suppress(ValueError):
+        name = urlsplit(f"//{host}").hostname
+        if name in ("localhost", "127.0.0.1", "::1", listening):
+            return True
+        if listening in ("0.0.0.0", "::", ""):  # any address or the machine's name: neither can be rebound
+            machine = socket.gethostname().lower()
+            return name in (machine, f"{machine}.local") or bool(ipaddress.ip_address(name or ""))
+    return False
+
+
+@contextlib.contextmanager
+def guarded(listening: str) -> Iterator[None]:
+    """Make the server that viser starts in this block, by a function of websockets, call :func:`refusal` first."""
+    library: Any = importlib.import_module("websockets.asyncio.server")
+    serve, started = library.serve, []
+
+    def guarded_serve(*given: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            why = refusal(request.headers.get_all("Host"), request.headers.get_all("Origin"), listening)
+            return connection.respond(403, f"{why}\n") if why else process_request(connection, request)
+
+        started.append(given)
+        return serve(*given, process_request=process, **options)
+
+    library.serve = guarded_serve
+    try:
+        yield
+    finally:
+        library.serve = serve
+    if not started:
+        msg = "this version of viser cannot be guarded against other web pages: install another"
+        raise RuntimeError(msg)
+
+
 def start_server(host: str, port: int) -> Any:
     """Start a `viser.ViserServer` that answers only its own pages. Warns if other machines can reach it."""
     import viser  # noqa: PLC0415
@@ -73,13 +130,11 @@ def start_server(host: str, port: int) -> Any:
 
 
 def stop_server(server: Any) -> None:
-    """Close all connections and end the threads of a server."""
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints
         server.stop()
 
 
 def set_initial_camera(server: Any, pose: CameraPose) -> None:
-    """Set the initial camera of new pages."""
     camera = server.initial_camera
     camera.fov = FOV_RAD
     camera.position, camera.look_at = map(tuple, pose)
@@ -118,12 +173,10 @@ class Page:
         self._server: Any = start_server(self.host, self.port)
 
     def wait(self) -> None:
-        """Wait until Ctrl-C."""
         while True:
             time.sleep(WAIT_STEP_S)
 
     def stop(self) -> None:
-        """Close the page and end all threads."""
         stop_server(self._server)
 
     def __enter__(self) -> Self:
@@ -145,3 +198,31 @@ def url_of(host: str, port: int) -> str:
     if host in ("127.0.0.1", "::1", "0.0.0.0", "::"):
         return f"http://localhost:{port}"
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+class CameraPose(NamedTuple):
+    position: Floats  # (3,) m
+    look_at: Floats  # (3,) m, centre of the orbit of the user's rotations
+
+
+def framing_pose(points: Floats, to_eye: Floats = _TO_EYE, aspect: float = ASPECT) -> CameraPose:
+    """Nearest camera, with z up, that sees all points (N, 3), m, in the direction `to_eye` (3,), which must not be vertical."""
+    back = to_eye / np.linalg.norm(to_eye)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    up = np.cross(back, right)
+    tangent = math.tan(FOV_RAD / 2) / _MARGIN
+    depth_m = points @ back
+    # A camera at a along an axis and t back sees a point x if |x - a| <= slope * (t - depth).
+    sides = [(axis, points @ axis, slope) for axis, slope in ((right, tangent * aspect), (up, tangent))]
+    ends = [((depth_m + x / slope).max(), (depth_m - x / slope).max(), slope) for _, x, slope in sides]
+    far_m = max(float(one + other) / 2 for one, other, _ in ends)
+    middle = np.zeros(3)
+    for (axis, x, _), (one, other, slope) in zip(sides, ends, strict=True):
+        a = slope * (one - other) / 2
+        for _ in range(4):  # if the frame is wider than needed, the middle shifts
+            at = (x - a) / (far_m - depth_m)
+            a += (at.max() + at.min()) / 2 * float(far_m - depth_m.mean())
+        middle = middle + a * axis
+    center_m = float(depth_m.min() + depth_m.max()) / 2
+    return CameraPose(middle + far_m * back, middle + center_m * back)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf._core import SurfaceTracer
-from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check, whole_number
+from radarsdf.io.glb import MATT, SRGB_TO_LINEAR, encode_glb
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
-from radarsdf.view.glb import lightness_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -23,6 +23,18 @@ if TYPE_CHECKING:
 
 
 _MIN_VERTICES = 1000  # smallest max_vertices: fewer show nothing useful
+# Colours as they are, like those of point clouds and legends.
+_UNLIT = MATT | {"extensions": {"KHR_materials_unlit": {}}}
+_TO_LIGHT = np.array([-0.35, -0.5, 0.79])
+_SHADE = 0.87  # lightness of faces averted from the light; higher keeps colours close to those of the legend
+# viser's page passes all meshes, even unlit ones, through three.js's ACESFilmicToneMapping, which turns indigo into navy
+# and yellow into olive. It is, on linear colours c:
+#     _OUT @ ((x² + a x - b) / (c x² + d x + e)), with x = _IN @ c / _EXPOSURE
+_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+_EXPOSURE = 0.6
+_FIT = (0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081)
+_BITS = np.uint32(13)  # dropped mantissa bits, below the 256 levels of a screen: zeros compress better
 
 
 @dataclass(frozen=True)
@@ -45,15 +57,11 @@ class ShownSurface:
         threshold = Threshold.of_mesh(mesh.metadata)
         mesh, spacing_m = thinned(mesh, max_vertices, voxel_size)
         check(len(mesh.vertices), "the map has no surface here")
-        return cls(
-            np.asarray(mesh.vertices, np.float64),
-            np.asarray(mesh.faces, np.int32),
-            np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float32),
-            np.asarray(mesh.vertex_attributes["confidence"], np.float32),
-            lightness_of(mesh.vertex_normals),
-            threshold,
-            spacing_m,
-        )
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+        names = ("uncertainty_m", "confidence")
+        uncertainty_m, confidence = (np.asarray(mesh.vertex_attributes[name], np.float32) for name in names)
+        lightness = lightness_of(mesh.vertex_normals)
+        return cls(vertices, faces, uncertainty_m, confidence, lightness, threshold, spacing_m)
 
     def kept(self, max_uncertainty_m: float, min_confidence: float) -> Bools:
         """Return a mask (V,) of vertices within the limits."""
@@ -103,12 +111,40 @@ def thinned(mesh: trimesh.Trimesh, max_vertices: int, edge_m: float) -> tuple[tr
     return thin, spacing_m
 
 
-def first_hit(
-    vertices: Floats, faces: Ints32, ray_origin: ArrayLike, ray_direction: ArrayLike
-) -> Floats | None:
+def first_hit(vertices: Floats, faces: Ints32, start: ArrayLike, toward: ArrayLike) -> Floats | None:
     """Point (3,) where a ray first hits a mesh, or None. The direction is of any length."""
-    origin, direction = np.asarray(ray_origin, np.float64), np.asarray(ray_direction, np.float64)
+    origin, direction = np.asarray(start, np.float64), np.asarray(toward, np.float64)
     direction = direction / np.linalg.norm(direction)
     tracer = SurfaceTracer(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32))
     (range_m,), _ = tracer.first_hits(origin.tolist(), direction[None].astype(np.float32), np.inf)
     return origin + float(range_m) * direction if np.isfinite(range_m) else None
+
+
+def glb(vertices: Array, faces: Array, colors: Bytes) -> bytes:
+    """Encode vertices (V, 3), as float32, faces (F, 3) and sRGB colours (V, 3) as the bytes of a GLB file."""
+    return encode_glb(vertices, faces, {"COLOR_0": light_to_show(colors)}, material=_UNLIT)
+
+
+def lightness_of(normals: Array) -> Floats32:
+    """(V,) lightness factor, at most 1, for normals (V, 3), which makes the shape visible."""
+    light = np.clip(np.asarray(normals, np.float64) @ _TO_LIGHT, 0.0, 1.0)
+    return np.asarray(_SHADE + (1 - _SHADE) * light, np.float32)
+
+
+def shaded(colors: Bytes, lightness: Array) -> Bytes:
+    """Scale the OKLab lightness and chroma of sRGB colours (V, 3) by factors (V,): both are cube roots of light."""
+    light = SRGB_TO_LINEAR[colors] * np.asarray(lightness, np.float64)[:, None] ** 3
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255 * srgb), np.uint8)
+
+
+def light_to_show(colors: Bytes) -> Floats32:
+    """(V, 3) linear colours of an unlit mesh that the page shows as these sRGB colours (V, 3): the inverse tone mapping."""
+    a, b, c, d, e = _FIT
+    y = SRGB_TO_LINEAR[colors] @ np.linalg.inv(_OUT).T
+    square, slope, rest = 1 - c * y, a - d * y, -b - e * y
+    x = (-slope + np.sqrt(np.maximum(slope**2 - 4 * square * rest, 0))) / (2 * square)
+    light = np.ascontiguousarray(_EXPOSURE * x @ np.linalg.inv(_IN).T, np.float32)
+    bits = light.view(np.uint32)
+    half = np.uint32(1) << (_BITS - np.uint32(1))
+    return ((bits + half) >> _BITS << _BITS).view(np.float32)

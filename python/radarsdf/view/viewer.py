@@ -10,10 +10,9 @@ import numpy as np
 from radarsdf.arrays import Floats
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
-from radarsdf.view.framing import FOV_RAD, CameraPose, framing_pose
 from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
 from radarsdf.view.scene import HELD_S, SCAN_COLORS, SLID_S, Canvas, Painter, ScanClouds, State
-from radarsdf.view.serving import Page, set_initial_camera
+from radarsdf.view.serving import FOV_RAD, CameraPose, Page, framing_pose, set_initial_camera
 from radarsdf.view.surface import ShownSurface, first_hit
 
 _GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
