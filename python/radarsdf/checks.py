@@ -156,9 +156,13 @@ def are_rigid(poses: Floats) -> Bools:
     rotation = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # non-finite matrices are not rigid
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        proper = (rotation_error < _MAX_ROTATION_ERROR) & (np.linalg.det(rotation) > 0)
-        within = (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
-    return proper & within & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
+        rigid: Bools = (
+            (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
+            & (rotation_error < _MAX_ROTATION_ERROR)
+            & (np.linalg.det(rotation) > 0)
+            & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
+        )
+    return rigid
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:

@@ -115,13 +115,14 @@ class Changes:
                 for faces in np.split(rows[np.argsort(labels, kind="stable")], ends) if len(rows) else []:
                     vertices = np.unique(surface.faces[faces])
                     x = surface.vertices[vertices]
-                    box, area_m2 = np.stack([x.min(axis=0), x.max(axis=0)]), float(areas[faces].sum())
-                    probability = float(surface.probability[vertices].mean())
-                    moved_m = _mean(surface.moved_m[vertices]) if kind == MOVED else None
-                    brighter = (
-                        _mean(surface.intensity_change[vertices]) if kind == REFLECTANCE_CHANGED else None
+                    region = Region(
+                        NAMES[kind],
+                        np.stack([x.min(axis=0), x.max(axis=0)]),
+                        float(areas[faces].sum()),
+                        float(surface.probability[vertices].mean()),
+                        _mean(surface.moved_m[vertices]) if kind == MOVED else None,
+                        _mean(surface.intensity_change[vertices]) if kind == REFLECTANCE_CHANGED else None,
                     )
-                    region = Region(NAMES[kind], box, area_m2, probability, moved_m, brighter)
                     if region.area_m2 >= min_area_m2:
                         found.append(region)
         return sorted(found, key=lambda region: -region.area_m2)

@@ -141,11 +141,14 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
         memory += 4 * schedule.batch_size * sum(sdf_widths(config)) * (3 if normals else 1)
     if rays.intensities is not None:
         memory += returns * _PER_RETURN_OF_INTENSITY
-    seconds = seconds_of(config, schedule, len(rays), cells, rows, with_network)
-    peak_bytes = int(max(memory, len(rays) * _PER_RETURN_CLEANED))
-    counts: dict[str, Any] = {"returns": returns, "leaf_cells": cells, "vertices": rows}
-    counts["iterations"] = schedule.iterations
-    return Estimate(peak_memory_bytes=peak_bytes, seconds=seconds, **counts)
+    return Estimate(
+        peak_memory_bytes=int(max(memory, len(rays) * _PER_RETURN_CLEANED)),
+        seconds=seconds_of(config, schedule, len(rays), cells, rows, with_network),
+        returns=returns,
+        leaf_cells=cells,
+        vertices=rows,
+        iterations=schedule.iterations,
+    )
 
 
 def seconds_of(

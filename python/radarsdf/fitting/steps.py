@@ -169,9 +169,12 @@ class _Fit:
         sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
         schedule = Schedule.of(config, with_intensity=with_network, **sizes)
         closes = learnt.intensities is not None and config.closes_intensity
-        contents = _contents(given, learnt, surface, leaf_keys, returns, config, num_threads)
-        report = _report(given, learnt, surface, field, schedule, config)
-        begun = _Begun(field, contents, report, (learnt, surface.surfels) if closes else None)
+        begun = _Begun(
+            field=field,
+            contents=_contents(given, learnt, surface, leaf_keys, returns, config, num_threads),
+            report=_report(given, learnt, surface, field, schedule, config),
+            intensities=(learnt, surface.surfels) if closes else None,
+        )
         training = None
         if isinstance(field, NeuralField):
             scale = given.scale if config.trains_intensity else None

@@ -85,14 +85,18 @@ class BodyVelocities(SensorVelocities):
             change = np.multiply.outer(apart_s**2 / 12 / durations_s + beyond_s, np.diag(changes[-1]))
             ends = (covariance[before] + covariance[after]) / 4
             variances.append(ends * (apart_s / durations_s)[:, None, None] + change)
-        change = np.min(changes, axis=0)  # they include the noise of each radar
-        none, found = [np.zeros(0, bool)] * count, np.ones(count, bool)  # moving returns were left out before
-        levers = skew(np.stack([mountings[rows[0], :3, 3] for rows, _ in measured]))
-        of_radars, of_steps = np.stack(of_radars_mps), np.stack(variances)
-        names = ("common_sigma", "clock_sigma_s")
-        largest = {name: max(getattr(velocities, name) for _, velocities in measured) for name in names}
-        body = mean, covariance, change, none, found
-        return cls(*body, of_radars_mps=of_radars, variances=of_steps, levers=levers, **largest)
+        return cls(
+            mean,
+            covariance,
+            np.min(changes, axis=0),  # they include the noise of each radar
+            [np.zeros(0, bool)] * count,  # moving returns were left out before
+            np.ones(count, bool),
+            common_sigma=max(velocities.common_sigma for _, velocities in measured),
+            clock_sigma_s=max(velocities.clock_sigma_s for _, velocities in measured),
+            of_radars_mps=np.stack(of_radars_mps),
+            variances=np.stack(variances),
+            levers=skew(np.stack([mountings[rows[0], :3, 3] for rows, _ in measured])),
+        )
 
     def select(self, rows: slice | Ints) -> Self:
         """Select consecutive scans; of others, velocities without those of steps."""

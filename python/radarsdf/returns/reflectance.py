@@ -118,10 +118,16 @@ class Reflectance:
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
         coefficients = response.coefficients.copy()
         coefficients[:, 0] += np.median(left - groups.of_returns(explained))
-        table, means = np.float32(times) * response.table, np.float32(times) * means
-        plane_keys = surfels.keys[surfels.cell_of_plane[flat]]
-        of_planes = times * coefficients, table, plane_keys, normals[flat]
-        return cls(leaf_size_m, *of_planes, keys, means.astype(np.float16), share)
+        return cls(
+            leaf_size_m,
+            times * coefficients,
+            np.float32(times) * response.table,
+            surfels.keys[surfels.cell_of_plane[flat]],
+            normals[flat],
+            keys,
+            (np.float32(times) * means).astype(np.float16),
+            share,
+        )
 
     def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
         """See :meth:`~radarsdf.returns.response.Response.measured`."""

@@ -235,9 +235,12 @@ def write_tileset(city: TileBlend, path: Path, meshes: Iterable[tuple[Floats, In
         write_whole(folder / name, data)
         T_world_tile = np.eye(4)
         T_world_tile[:3, 3] = origin
-        child: dict[str, Any] = {"boundingVolume": _box(local), "geometricError": 0.0}
-        child["content"] = {"uri": quote(f"{folder.name}/{name}")}
-        child["transform"] = T_world_tile.T.ravel().tolist()  # column-major
+        child = {
+            "boundingVolume": _box(local),
+            "geometricError": 0.0,
+            "content": {"uri": quote(f"{folder.name}/{name}")},
+            "transform": T_world_tile.T.ravel().tolist(),  # column-major
+        }
         children.append(child)
         corners += [vertices.min(axis=0), vertices.max(axis=0)]
         count += len(vertices), len(faces)

@@ -193,10 +193,12 @@ class Plan:
             described = by_name(json.loads(content), "the plan")
             check({name: described.pop(name, None) for name in FORMAT} == FORMAT, f"it is not of {FORMAT}")
             described.pop("crc32")
-            config = FitConfig.from_dict(described.pop("config"))
-            sensor = Sensor.from_dict(described.pop("sensor"))
-            tiles = tuple(TilePlan(**planned) for planned in described.pop("tiles"))
-            plan = cls(config=config, sensor=sensor, tiles=tiles, **described)
+            plan = cls(
+                config=FitConfig.from_dict(described.pop("config")),
+                sensor=Sensor.from_dict(described.pop("sensor")),
+                tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
+                **described,
+            )
             check(plan._file_bytes() == content, "its checksum is wrong")
             return plan
 
