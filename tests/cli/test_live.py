@@ -1,8 +1,11 @@
 """``radarsdf live`` replays a recording, reports whether the map kept up, and writes it."""
 
+import contextlib
 import re
+import socket
 import subprocess
 import sys
+import time
 from unittest.mock import Mock
 
 import numpy as np
@@ -11,7 +14,7 @@ import radarsdf
 from radarsdf.cli.live import Replay, _Shown, replay
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
-from radarsdf.view.sinks import FREE_COLOR
+from radarsdf.view.sinks import FREE_COLOR, foxglove_sink, rerun_sink
 
 from ..conftest import ground_and_wall
 from .calls import refusal, values
@@ -181,3 +184,26 @@ def test_a_failed_replay_leaves_no_files(recording, capsys):
 def test_missing_viewers_are_named(option, missing, recording, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, option.strip("-"), None)
     assert missing in refusal(capsys, recording, "live", recording / "scans.npz", option)
+
+
+@pytest.mark.parametrize(("open_sink", "library"), [(foxglove_sink, "foxglove"), (rerun_sink, "rerun")])
+def test_viewers_are_served_to_this_machine_only(open_sink, library):
+    pytest.importorskip(library)
+
+    def answers(host, port):
+        with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1):
+            return True
+        return False
+
+    def all_answer(ports, wanted):
+        until_s = time.monotonic() + 30
+        while {answers("127.0.0.1", port) for port in ports} != {wanted} and time.monotonic() < until_s:
+            time.sleep(0.1)
+        return {answers("127.0.0.1", port) for port in ports} == {wanted}
+
+    with open_sink(None) as (_, url):
+        ports = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", url)]
+        assert len(ports) >= 1
+        assert all_answer(ports, True)
+        assert not any(answers("127.0.0.2", port) for port in ports)  # also this machine, on Linux
+    assert all_answer(ports, False)

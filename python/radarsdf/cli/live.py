@@ -131,7 +131,7 @@ def live(given: Namespace, results: Results) -> None:
             write_poses(trajectory, np.stack(done.poses), times_s)
             results.add(f"trajectory {trajectory}", trajectory=trajectory)
         if shown is not None:
-            shown.show(done.poses, float(done.times_s[done.rows[-1]]))
+            shown.show(done.poses, float(done.times_s[done.rows[-1]]), final=True)
         files.close()
         if urls:
             results.end()
@@ -156,11 +156,10 @@ class _Shown:
             sink.show_scan(scan, time_s)
         if not self._thread.is_alive() and time.monotonic() > self._next_s:
             self._next_s = time.monotonic() + _SHOWN_EVERY_S
-            arguments = list(done.poses), time_s, False
-            self._thread = threading.Thread(target=self.show, args=arguments, daemon=True)
+            self._thread = threading.Thread(target=self.show, args=[list(done.poses), time_s], daemon=True)
             self._thread.start()
 
-    def show(self, poses: list[Floats], time_s: float, final: bool = True) -> None:
+    def show(self, poses: list[Floats], time_s: float, final: bool = False) -> None:
         with self._lock:
             mesh = self._map.mesh()
             for sink in self._sinks if len(mesh.faces) else ():

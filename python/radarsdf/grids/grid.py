@@ -162,7 +162,6 @@ class Grid:
             state[touched], rows[touched] = OCCUPIED, len(points) + k
         boxes = np.concatenate([np.stack([points, points], axis=1), stamped])
         normals = np.concatenate([normals, np.zeros((len(stamped), 3))])
-
         occupied, free = state == OCCUPIED, state == FREE
         occupied_m, surface_m = np.full((2, *self.shape), np.inf, np.float32)
         if occupied.any():

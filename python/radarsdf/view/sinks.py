@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
+import os
 import shutil
 import subprocess
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,9 +29,8 @@ if TYPE_CHECKING:
     import trimesh
 
 PATH_COLOR, FREE_COLOR = (0, 190, 255), (90, 160, 120)
-_STATE_COLORS = np.array(
-    [[*FREE_COLOR, 40], [200, 60, 40, 255], [0, 0, 0, 0]], np.uint8
-)  # free, occupied, unknown: RGBA
+# RGBA of free, occupied and unknown voxels.
+_STATE_COLORS = np.array([[*FREE_COLOR, 40], [200, 60, 40, 255], [0, 0, 0, 0]], np.uint8)
 _CELL = [(name, "u1") for name in ("red", "green", "blue", "alpha")]
 
 
@@ -88,8 +88,8 @@ class FoxgloveSink(Sink):
         triangles = of.TriangleListPrimitive(pose=line["pose"]).encode() + _points(4, colors)
         triangles += _points(2, self._local(mesh.vertices)) + _field(5, mesh.faces.astype("<u4").tobytes())
         entity = of.SceneEntity(timestamp=self._stamp(time_s), frame_id="map", id="surface").encode()
-        entity += _field(11, lines) + _field(12, triangles)
-        self._log("/surface", of.SceneUpdate, time_s, _field(2, entity))
+        entity = _field(2, entity + _field(11, lines) + _field(12, triangles))
+        self._log("/surface", of.SceneUpdate, time_s, entity)
 
     def show_grid(self, grid: Grid, time_s: float) -> None:
         of, size_m, cells = self._of, grid.voxel_size, _cells(grid.state)
@@ -128,8 +128,7 @@ class FoxgloveSink(Sink):
         return vector, self._of.Quaternion(x=x, y=y, z=z, w=w)
 
     def _pose(self, position: Any) -> Any:
-        vector, rotation = self._placed(position)
-        return self._of.Pose(position=vector, orientation=rotation)
+        return self._of.Pose(**dict(zip(("position", "orientation"), self._placed(position), strict=True)))
 
 
 class RerunSink(Sink):
@@ -197,8 +196,11 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
     port = free_port(LOCALHOST, None, 9876)
     page = free_port(LOCALHOST, None, port + 1)
     words = ["--serve-web", "--bind", LOCALHOST, "--port", str(port), "--web-viewer-port", str(page)]
-    # The SDK itself would serve to all machines.
-    with subprocess.Popen([sys.executable, "-m", "rerun", *words], stderr=subprocess.DEVNULL) as server:
+    # The SDK itself would serve to all machines, and `python -m rerun` is the parent of the viewer. Ctrl-C is not for it.
+    package = Path(importlib.import_module("rerun_cli").__file__ or "").parent
+    binary = shutil.which("rerun", path=f"{package}{os.pathsep}{package / 'Rerun.app/Contents/MacOS'}")
+    quiet: dict[str, Any] = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+    with subprocess.Popen([binary or "rerun", *words], start_new_session=True, **quiet) as server:
         try:
             stream.connect_grpc(url := f"rerun+http://{LOCALHOST}:{port}/proxy")
             yield RerunSink(rerun, stream), f"http://{LOCALHOST}:{page}?url={quote(url)}"
