@@ -7,8 +7,10 @@ from typing import Any
 
 REQUIREMENTS = {
     "distributed": "distributed>=2024.8",
+    "foxglove": "foxglove-sdk>=0.30",
     "laspy": "laspy[lazrs]>=2.5",
     "matplotlib": "matplotlib>=3.7",
+    "rerun": "rerun-sdk>=0.24",
     "rosbags": "rosbags>=0.11",
     "viser": "viser>=1.1",
 }

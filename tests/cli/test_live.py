@@ -1,13 +1,20 @@
 """``radarsdf live`` replays a recording, reports whether the map kept up, and writes it."""
 
+import contextlib
+import re
+import socket
+import subprocess
+import sys
+import time
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli.live import Replay, _PeriodicView, replay
+from radarsdf.cli.live import Replay, _Shown, replay
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
+from radarsdf.view.sinks import FREE_COLOR, foxglove_sink, rerun_sink
 
 from ..conftest import ground_and_wall
 from .calls import refusal, values
@@ -73,13 +80,130 @@ def test_scans_without_poses_need_times(recording, capsys):
     assert "times" in refusal(capsys, recording, "live", recording / "scans.npz", "--find")
 
 
-def test_the_page_shows_the_surface_periodically():
-    page, done = Mock(), Replay(poses=[np.eye(4) + np.eye(4)[:, :1] * np.eye(4)[3]])
-    shown = _PeriodicView(Mock(**{"mesh.return_value": "mesh"}), page)
-    for due, times in ((True, 1), (False, 1), (True, 2)):
+def test_sinks_get_all_scans_and_periodically_the_surface():
+    sink, mesh = Mock(), Mock(faces=[0])
+    scans = Scans(SCENE.points, SCENE.poses, None)
+    growing = Mock(**{"mesh.return_value": mesh, "config.returns.free_space": False})
+    shown = _Shown(growing, scans, [sink])
+    for i, (due, times) in enumerate([(True, 1), (False, 1), (True, 2)]):
         shown._next_s = 0.0 if due else shown._next_s
-        shown(done)
+        shown(Replay(0.1 * np.arange(6), list(range(i + 1)), list(SCENE.poses[: i + 1])))
         shown._thread.join()
-        assert page.show.call_count == times
-    mesh, path = page.show.call_args.args
-    assert (mesh, path.tolist()) == ("mesh", [[1.0, 0.0, 0.0]])
+        assert sink.show_surface.call_count == times
+    assert [call.args[1] for call in sink.show_scan.call_args_list] == [0.0, 0.1, 0.2]
+    assert sink.show_scan.call_args.args[0].points is SCENE.points[2]
+    assert sink.show_surface.call_args.args[0] is mesh
+    np.testing.assert_array_equal(sink.show_surface.call_args.args[1], SCENE.poses[:3, :3, 3])
+    assert not sink.show_grid.called
+
+
+def test_mcap_readers_decode_what_is_shown(recording, capsys):
+    decoder = pytest.importorskip("mcap_protobuf.decoder").DecoderFactory()
+    pytest.importorskip("foxglove")
+    from mcap.reader import make_reader  # noqa: PLC0415
+
+    out, made = recording / "o.mcap", recording / "map.safetensors"
+    values(capsys, "live", recording / "scans.npz", "--rate", 0, "--quiet", "--mcap", out, "-o", made)
+    messages = {}
+    with out.open("rb") as file:
+        for schema, channel, message, decoded in make_reader(
+            file, decoder_factories=[decoder]
+        ).iter_decoded_messages():
+            messages.setdefault((channel.topic, schema.name.removeprefix("foxglove.")), []).append(
+                (message, decoded)
+            )
+    one_each = [("/tf", "FrameTransform"), ("/pose/radar", "PoseInFrame"), ("/returns/radar", "PointCloud")]
+    assert set(messages) == {
+        *one_each,
+        ("/surface", "SceneUpdate"),
+        ("/free_space", "VoxelGrid"),
+        ("/grid", "Grid"),
+    }
+    for key in one_each:
+        assert [message.log_time for message, _ in messages[key]] == [round(1e8 * i) for i in range(6)]
+    cloud = messages[one_each[2]][3][1]
+    rows = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)
+    np.testing.assert_array_equal(
+        rows, np.column_stack([SCENE.points[3], SCENE.intensities[3]]).astype(np.float32)
+    )
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "intensity"]
+    assert messages[one_each[0]][3][1].translation.x == SCENE.poses[3, 0, 3]
+    entity = messages["/surface", "SceneUpdate"][-1][1].entities[0]
+    mesh, found = radarsdf.load(made).mesh(0.2), entity.triangles[0]
+    vertices = np.array([[p.x, p.y, p.z] for p in found.points])
+    assert len(found.colors) == len(vertices) > 0.5 * len(mesh.vertices)
+    assert max(found.indices) == len(vertices) - 1
+    assert np.isin(np.round(vertices[:, 2], 1), [0.0]).any()
+    assert (vertices.min(axis=0) > mesh.bounds[0] - 1).all()
+    assert (vertices.max(axis=0) < mesh.bounds[1] + 1).all()
+    assert [point.x for point in entity.lines[0].points] == SCENE.poses[:, 0, 3].tolist()
+    space = messages["/free_space", "VoxelGrid"][-1][1]
+    cells = np.frombuffer(space.data, "u1").reshape(
+        -1, space.row_count, space.column_count, space.cell_stride
+    )
+    assert (space.slice_stride, space.row_stride) == cells.strides[:2]
+    origin = np.array([getattr(space.pose.position, axis) for axis in "xyz"])
+    ahead = np.array(
+        [[12.0, 0.0, 1.0], [30.0, 0.0, 1.0], [14.0, 0.0, 0.01]]
+    )  # free, hidden by the wall, ground
+    x, y, z = np.floor((ahead - origin) / space.cell_size.x).astype(int).T
+    inside = x < space.column_count
+    assert tuple(cells[z[inside][0], y[inside][0], x[inside][0]]) == (*FREE_COLOR, 40)
+    grid = messages["/grid", "Grid"][-1][1]
+    assert len(grid.data) == space.row_count * space.column_count * grid.cell_stride
+
+
+def test_rerun_reads_what_is_shown(recording, capsys):
+    pytest.importorskip("rerun")
+    out = recording / "o.rrd"
+    values(capsys, "live", recording / "scans.npz", "--rate", 0, "--quiet", "--rrd", out)
+
+    def rerun(*words):
+        command = [sys.executable, "-m", "rerun", "rrd", *words, out]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    rerun("verify")
+    rows = re.findall(r"with (\d+) rows .* - /map/(\S+)", rerun("print"))
+    counts = {name: sum(int(n) for n, other in rows if other == name) for _, name in rows}
+    assert {name: counts[name] for name in ("radar", "radar/returns")} == {"radar": 6, "radar/returns": 6}
+    assert min(counts[name] for name in ("surface", "trajectory", "free_space")) >= 1
+
+
+def test_a_failed_replay_leaves_no_files(recording, capsys):
+    pytest.importorskip("foxglove")
+    pytest.importorskip("rerun")
+    outputs = [recording / "o.mcap", recording / "o.rrd"]
+    outputs[0].write_bytes(b"old")
+    words = ["live", recording / "scans.npz", "--find", "--mcap", outputs[0], "--rrd", outputs[1]]
+    refusal(capsys, recording, *words)
+    assert outputs[0].read_bytes() == b"old"
+    assert {path.name for path in recording.iterdir()} == {"scans.npz", "o.mcap"}
+
+
+@pytest.mark.parametrize(("option", "missing"), [("--foxglove", "foxglove-sdk"), ("--rerun", "rerun-sdk")])
+def test_missing_viewers_are_named(option, missing, recording, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, option.strip("-"), None)
+    assert missing in refusal(capsys, recording, "live", recording / "scans.npz", option)
+
+
+@pytest.mark.parametrize(("open_sink", "library"), [(foxglove_sink, "foxglove"), (rerun_sink, "rerun")])
+def test_viewers_are_served_to_this_machine_only(open_sink, library):
+    pytest.importorskip(library)
+
+    def answers(host, port):
+        with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1):
+            return True
+        return False
+
+    def all_answer(ports, wanted):
+        until_s = time.monotonic() + 30
+        while {answers("127.0.0.1", port) for port in ports} != {wanted} and time.monotonic() < until_s:
+            time.sleep(0.1)
+        return {answers("127.0.0.1", port) for port in ports} == {wanted}
+
+    with open_sink(None) as (_, url):
+        ports = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", url)]
+        assert len(ports) >= 1
+        assert all_answer(ports, True)
+        assert not any(answers("127.0.0.2", port) for port in ports)  # also this machine, on Linux
+    assert all_answer(ports, False)

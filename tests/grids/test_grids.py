@@ -144,8 +144,67 @@ def test_distances_equal_a_brute_force_search():
     np.testing.assert_allclose(field.not_free_m.ravel(), expected_not_free, rtol=1e-6)
     assert field.error_m == pytest.approx(np.sqrt(3) / 4)
     nothing = made(np.zeros((2, 2, 2)), [0, 0, 0], 0.5).distances()
+    assert np.isinf(nothing.at([[0.5, 0.5, 0.5]])[0]).all()
     assert np.isinf(nothing.occupied_m).all()
     assert (nothing.not_free_m == 0.5).all()
+
+
+def sloped():
+    """Grid of a plane through the box [0, 4] m: free above, occupied next to it, unknown below; and its unit normal."""
+    normal = np.array([0.2, -0.3, 0.933])
+    normal /= np.linalg.norm(normal)
+    centres = (np.argwhere(np.ones((20, 20, 20))) + 0.5) * 0.2
+    distance_m = ((centres - 2) @ normal).reshape(20, 20, 20).astype(np.float32)
+    state = np.where(distance_m > 0, 0, -1)
+    state[np.abs(distance_m) <= 0.15] = 1
+    distance_m[np.abs(distance_m) > 0.3] = np.nan  # not observed
+    return Grid(np.zeros(3), 0.2, state.astype(np.int8), distance_m, distance_m, 0.0), normal
+
+
+def test_interpolated_distances_and_gradients_of_a_plane():
+    grid, normal = sloped()
+    field = grid.distances()
+    x = np.random.default_rng(0).uniform(0, 4, (20_000, 3))
+    distance_m, gradient = field.at(x)
+    np.testing.assert_array_equal(np.isnan(distance_m), grid.at(x) == -1)
+    np.testing.assert_array_equal(np.isnan(gradient).all(axis=1), grid.at(x) == -1)
+    inner = (np.abs(x - 2) < 1.2).all(axis=1) & (grid.at(x) >= 0)
+    expected = (x[inner] - 2) @ normal
+    assert np.abs(distance_m[inner] - expected).max() < 0.06
+    assert np.median(np.abs(distance_m[inner] - expected)) < 0.025
+    assert (gradient[inner] @ normal > 0.8).all()
+    from scipy.interpolate import RegularGridInterpolator  # noqa: PLC0415
+
+    peer = RegularGridInterpolator([(np.arange(20) + 0.5) * 0.2] * 3, field.surface_m)
+    x = x[((x > 0.1) & (x < 3.9)).all(axis=1) & (grid.at(x) >= 0)]
+    np.testing.assert_allclose(field.at(x)[0], peer(x), atol=1e-5)
+    cells = np.floor(x / 0.2 - 0.5)
+    x = x[(np.floor((x + 1e-4) / 0.2 - 0.5) == cells).all(axis=1)]
+    slopes = [(peer(x + step) - peer(x)) / 1e-4 for step in 1e-4 * np.eye(3)]
+    np.testing.assert_allclose(field.at(x)[1].T, slopes, atol=0.01)
+    outside = field.at([[np.nan, 1, 1], [1, 1, 4.01], [1e30, -1e30, np.inf]])
+    assert np.isnan(outside[0]).all()
+    assert np.isnan(outside[1]).all()
+
+
+def test_obstacles_count_as_surface_where_the_map_has_none():
+    grid, _ = sloped()
+    boxes = [
+        [[1.03, 1.1, 3.05], [1.62, 2.0, 9.0]],
+        [[9, 9, 9], [10, 10, 10]],
+    ]  # one of them reaches out, one is outside
+    field = grid.distances(boxes)
+    x = np.array([[0.65, 1.5, 3.6], [1.3, 1.5, 3.6], [2.1, 1.5, 3.6]])
+    distance_m, gradient = field.at(x)
+    np.testing.assert_allclose(distance_m, [1.03 - 0.65, -0.27, 2.1 - 1.62], atol=1e-5)
+    np.testing.assert_allclose(gradient[[0, 2]], [[-1, 0, 0], [1, 0, 0]], atol=1e-5)
+    assert (field.occupied_m < 0).sum() > (grid.distances().occupied_m < 0).sum()
+    below = [[2.05, 2.15, 0.55]]  # a point in unknown space
+    assert np.isnan(grid.distances().at(below)[0])
+    assert grid.distances(below).at(below)[0] < 0.5 * np.sqrt(3) * 0.2  # a corner of its voxel
+    for wrong in (np.zeros((2, 2)), [[[1, 1, 1], [0, 2, 2]]], [[np.nan, 0, 0]]):
+        with pytest.raises(ValueError, match="obstacles must be"):
+            grid.distances(wrong)
 
 
 def test_positions_are_located_in_their_voxel():

@@ -1,5 +1,6 @@
 """Pages of a growing surface and of changes, in coordinates representable in float32."""
 
+import io
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from radarsdf.changes.changes import (
     ChangedSurface,
     Changes,
 )
+from radarsdf.scans import Scan
 from radarsdf.view import pages, serving
 
 FAR = np.array([4e5, 5e6, 100.0])  # UTM: float32 would round it to half a metre
@@ -26,7 +28,7 @@ def server(monkeypatch):
     shown, texts = {}, []
     scene = SimpleNamespace(
         add_glb=lambda name, data, **_: shown.update({name: data}),
-        add_mesh_simple=lambda name, *mesh, **_: shown.update({name: mesh}),
+        add_point_cloud=lambda name, points, *_, **__: shown.update({name: points}),
         add_line_segments=lambda name, points, *_, **__: shown.update({name: points}),
     )
     server = SimpleNamespace(
@@ -40,21 +42,23 @@ def server(monkeypatch):
 
 
 def test_a_growing_surface_is_replaced(server):
-    path = FAR + np.array([[0, 0, 1.5], [1, 0, 1.5], [2, 0, 1.5]])
+    path = FAR + np.array([[300.0, 0, 1.5], [301, 0, 1.5], [302, 0, 1.5]])
+    origin = np.round(path[0], -3)
     with pages.GrowingView(port=0) as view:
-        view.show(trimesh.Trimesh(), path)
-        assert server.shown == {}
         for size in (1.0, 2.0):
             mesh = trimesh.creation.box([size] * 3)
             mesh.apply_translation(FAR)
-            view.show(mesh, path)
-    vertices, faces = server.shown["/surface"]
-    assert vertices.dtype == np.float32
-    assert np.allclose(np.ptp(vertices, axis=0), 2.0, atol=1e-6)
-    assert len(faces) == 12
-    np.testing.assert_allclose(vertices, mesh.vertices - path[0], atol=1e-6)
-    np.testing.assert_allclose(server.shown["/path"], np.stack([path[:-1], path[1:]], 1) - path[0])
-    assert np.abs(server.initial_camera.position).max() < 100
+            mesh.vertex_attributes["uncertainty_m"] = np.linspace(0.01, 0.1, len(mesh.vertices))
+            view.show_surface(mesh, path, 0.0)
+        view.show_scan(Scan(np.ones((5, 3), np.float32), np.eye(4) + np.eye(4, k=3) * FAR[0]), 0.0)
+    shown = trimesh.load_mesh(io.BytesIO(server.shown["/surface"]), "glb", process=False)
+    np.testing.assert_allclose(
+        np.sort(shown.vertices, axis=0), np.sort(mesh.vertices - origin, axis=0), atol=1e-4
+    )
+    assert b"COLOR_0" in server.shown["/surface"]
+    np.testing.assert_allclose(server.shown["/path"], np.stack([path[:-1], path[1:]], 1) - origin)
+    np.testing.assert_allclose(server.shown["/returns"][:, 0], 1 + FAR[0] - origin[0], atol=1e-4)
+    assert np.abs(server.initial_camera.position).max() < 1000
 
 
 def triangles(kinds, offset):

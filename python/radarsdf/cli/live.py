@@ -10,30 +10,35 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import check
-from radarsdf.cli.inputs import check_address, inputs_of, scans_or_unposed
+from radarsdf.cli.inputs import inputs_of, scans_or_unposed
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.cli.settings import load_config
+from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
 from radarsdf.live.live_map import LiveMap
 from radarsdf.live.tracking import Lost
-from radarsdf.scans import Scans
+from radarsdf.scans import Scan, Scans
 from radarsdf.view.pages import GrowingView
-from radarsdf.view.serving import url_of
+from radarsdf.view.serving import url_of, wait
+from radarsdf.view.sinks import Sink, foxglove_sink, rerun_sink
 
 _SHOWN_EVERY_S = 0.5
+_GRID_SHARE = 0.05  # share of the time spent on free space, for which a map is fitted anew
+_MAX_VOXELS = 500_000
 
 
 @dataclass
 class Replay:
     """Results of a replay: indices of integrated scans with their poses and seconds, and of the others."""
 
+    times_s: Floats  # of all scans
     rows: list[int] = field(default_factory=list)
-    poses: list[NDArray[np.float64]] = field(default_factory=list)
+    poses: list[Floats] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     dropped: list[int] = field(default_factory=list)  # the map was not ready
     lost: list[int] = field(default_factory=list)  # tracking failed for these scans without poses
@@ -49,9 +54,9 @@ def replay(
     on_scan: Callable[[Replay], None] | None = None,
 ) -> Replay:
     """Integrate scans at `rate` times the recorded speed; 0: as fast as possible. A scan is dropped once the next one arrives."""
-    done, count = Replay(), len(scans.points)
-    times_s = scans.times_s if scans.times_s is not None else 0.1 * np.arange(count)
-    due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
+    count = len(scans.points)
+    done = Replay(np.asarray(0.1 * np.arange(count) if scans.times_s is None else scans.times_s))
+    due_s = (done.times_s - done.times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
     labels = None if scans.T_body_sensor is None else scans.sensors
     begin = time.perf_counter()
     for i in range(count):
@@ -67,7 +72,7 @@ def replay(
                 scans.poses[i] if with_poses else None,
                 None if scans.intensities is None else scans.intensities[i],
                 doppler_mps=None if scans.doppler_mps is None else scans.doppler_mps[i],
-                time_s=float(times_s[i]),
+                time_s=float(done.times_s[i]),
                 scan_id=i,
                 sensor=None if labels is None else labels[i],
             )
@@ -92,21 +97,29 @@ def live(given: Namespace, results: Results) -> None:
     out, trajectory = given.out, given.trajectory
     if trajectory is not None:
         checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
-    check_outputs([out, trajectory], inputs_of(given))
-    if given.view:
-        check_address(given)
-    scans, unposed = scans_or_unposed(given, find=given.find)
-    timed = scans.times_s is not None or not unposed
-    check(timed, f"{given.scans}: scans without poses need times, one per scan")
-    if trajectory is not None:
-        check_pose_times(trajectory, scans.times_s)
-    growing = LiveMap(load_config(given), T_body_sensor=scans.T_body_sensor)
-    with contextlib.ExitStack() as stack:
-        shown = None
+    check_outputs([out, trajectory, given.mcap, given.rrd], inputs_of(given))
+    with contextlib.ExitStack() as servers, contextlib.ExitStack() as files:
+        sinks: list[Sink] = []
+        urls: list[str] = []
         if given.view:
-            page = stack.enter_context(GrowingView(host=given.host, port=given.port))
-            results.add(f"live map on {url_of(page.host, page.port)}; Ctrl-C ends it")
-            shown = _PeriodicView(growing, page)
+            page = servers.enter_context(GrowingView(host=given.host, port=given.port))
+            sinks, urls = [page], [url_of(page.host, page.port)]
+        of_viewers = (foxglove_sink, given.foxglove, given.mcap), (rerun_sink, given.rerun, given.rrd)
+        for open_sink, served, path in of_viewers:
+            if served:
+                sink, url = servers.enter_context(open_sink(None))
+                sinks, urls = [*sinks, sink], [*urls, url]
+            if path is not None:
+                sinks.append(files.enter_context(open_sink(path))[0])
+        scans, unposed = scans_or_unposed(given, find=given.find)
+        timed = scans.times_s is not None or not unposed
+        check(timed, f"{given.scans}: scans without poses need times, one per scan")
+        if trajectory is not None:
+            check_pose_times(trajectory, scans.times_s)
+        growing = LiveMap(load_config(given), T_body_sensor=scans.T_body_sensor)
+        if urls:
+            results.add(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
+        shown = _Shown(growing, scans, sinks) if sinks else None
         done = replay(growing, scans, with_poses=not unposed, rate=given.rate, on_scan=shown)
         _add_rates(results, done, len(scans))
         if out is not None:
@@ -118,28 +131,47 @@ def live(given: Namespace, results: Results) -> None:
             write_poses(trajectory, np.stack(done.poses), times_s)
             results.add(f"trajectory {trajectory}", trajectory=trajectory)
         if shown is not None:
-            shown.show(done.poses)
+            shown.show(done.poses, float(done.times_s[done.rows[-1]]), final=True)
+        files.close()
+        if urls:
             results.end()
-            until_stopped(page)
+            until_stopped(wait)
 
 
-class _PeriodicView:
-    """Callback after each scan that updates the page periodically, in its own thread."""
+class _Shown:
+    """Callback after each scan that passes it to all sinks, and periodically the surface and free space, in its own thread."""
 
-    def __init__(self, live_map: LiveMap, page: GrowingView) -> None:
-        self._map, self._page = live_map, page
+    def __init__(self, live_map: LiveMap, scans: Scans, sinks: list[Sink]) -> None:
+        self._map, self._scans, self._sinks = live_map, scans, sinks
         self._thread, self._lock = threading.Thread(), threading.Lock()
-        self._next_s = 0.0
+        self._next_s, self._next_grid_s = 0.0, 0.0
 
     def __call__(self, done: Replay) -> None:
+        i, pose, scans = done.rows[-1], done.poses[-1], self._scans
+        label = None if scans.sensors is None else scans.sensors[i]
+        T = pose if scans.T_body_sensor is None else pose @ scans.T_body_sensor[label]
+        intensities = None if scans.intensities is None else scans.intensities[i]
+        scan, time_s = Scan(scans.points[i], T, intensities, sensor=label), float(done.times_s[i])
+        for sink in self._sinks:
+            sink.show_scan(scan, time_s)
         if not self._thread.is_alive() and time.monotonic() > self._next_s:
             self._next_s = time.monotonic() + _SHOWN_EVERY_S
-            self._thread = threading.Thread(target=self.show, args=[list(done.poses)], daemon=True)
+            self._thread = threading.Thread(target=self.show, args=[list(done.poses), time_s], daemon=True)
             self._thread.start()
 
-    def show(self, poses: list[NDArray[np.float64]]) -> None:
+    def show(self, poses: list[Floats], time_s: float, final: bool = False) -> None:
         with self._lock:
-            self._page.show(self._map.mesh(), np.array(poses)[:, :3, 3])
+            mesh = self._map.mesh()
+            for sink in self._sinks if len(mesh.faces) else ():
+                sink.show_surface(mesh, np.array(poses)[:, :3, 3], time_s)
+            began_s = time.monotonic()
+            if self._map.config.returns.free_space and (final or began_s >= self._next_grid_s):
+                made = self._map.map()
+                edge_m = float(np.cbrt(np.prod(np.ptp(made.extent, axis=0)) / _MAX_VOXELS))
+                grid = grid_of(made, made.extent, max(made.config.leaf_size_m, edge_m))
+                for sink in self._sinks:
+                    sink.show_grid(grid, time_s)
+                self._next_grid_s = time.monotonic() + (time.monotonic() - began_s) / _GRID_SHARE
 
 
 def _add_rates(results: Results, done: Replay, scans: int) -> None:

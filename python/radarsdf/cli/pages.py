@@ -29,7 +29,7 @@ def view(given: Namespace, results: Results) -> None:
         print(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it", flush=True)
         if serving.has_display() if given.open is None else given.open:
             webbrowser.open(url)
-        until_stopped(viewer)
+        until_stopped(viewer.wait)
 
 
 def report(given: Namespace, results: Results) -> None:

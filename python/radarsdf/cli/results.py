@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # pages of help or settings need no PyTorch
     from radarsdf.map.threshold import Threshold
-    from radarsdf.view.serving import Page
 
 
 class Results:
@@ -70,9 +69,9 @@ def warn(text: str) -> None:
         print(text, file=sys.stderr)
 
 
-def until_stopped(page: Page) -> None:
-    """Serve a page until Ctrl-C, which is the normal end and not a failure."""
+def until_stopped(wait: Callable[[], None]) -> None:
+    """Wait until Ctrl-C, which is the normal end and not a failure."""
     try:
-        page.wait()
+        wait()
     except KeyboardInterrupt:
         print("stopped")

@@ -16,7 +16,7 @@ from radarsdf.render.figures import save_grid_picture
 from radarsdf.report.page import require_extras
 from radarsdf.report.writing import write_changes_report
 from radarsdf.view.pages import ChangesView
-from radarsdf.view.serving import url_of
+from radarsdf.view.serving import url_of, wait
 
 _LISTED = 10  # regions, largest first
 
@@ -61,7 +61,7 @@ def compare(given: Namespace, results: Results) -> None:
         results.end()
         with ChangesView(changes, regions, edge_m, host=given.host, port=given.port) as page:
             print(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
-            until_stopped(page)
+            until_stopped(wait)
 
 
 def grid(given: Namespace, results: Results) -> None:

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from radarsdf.arrays import Bools, Floats, Floats32
-from radarsdf.checks import check, number, path_of, real_array
+from radarsdf.checks import check, number, path_of
+from radarsdf.grids.distances import DistanceField, checked_obstacles, checked_positions, distances_to_boxes
 from radarsdf.grids.files import write_map_server, write_octomap
 from radarsdf.io.files import checked_suffix
 from radarsdf.io.npz import write_arrays
@@ -22,22 +23,7 @@ from radarsdf.settings import settings
 UNKNOWN, FREE, OCCUPIED = -1, 0, 1
 LETHAL = 100
 """Cost of a column that the vehicle cannot enter, as in ROS."""
-
 _Metres = Annotated[float, Field(gt=0, le=100)]
-
-
-@dataclass(frozen=True)
-class DistanceField:
-    """Euclidean distances from the centre of each voxel of a grid."""
-
-    occupied_m: Floats32
-    """(X, Y, Z) distance to the centre of the nearest occupied voxel, m; in occupied voxels the negative distance to the
-    nearest other one. Unknown voxels do not count: infinite if nothing is occupied."""
-    not_free_m: Floats32
-    """(X, Y, Z) distance to the centre of the nearest voxel that is not free or outside the grid, m; 0 if not free."""
-    error_m: float
-    """Half a diagonal of a voxel plus the position error of the surface, m. Not an upper bound: false returns and missing
-    surface add to it."""
 
 
 @settings
@@ -143,17 +129,22 @@ class Grid:
 
         It is unknown outside the grid, and at non-finite positions. Raises a ValueError for another shape.
         """
-        positions = real_array(x, "positions")
-        rows = positions.ndim == 2 and positions.shape[1] == 3
-        check(rows, f"positions must have shape (N, 3), not {positions.shape}")
+        positions = checked_positions(x)
         voxels = np.nan_to_num(np.floor((positions - self.origin) / self.voxel_size), nan=-1)
         inside = ((voxels >= 0) & (voxels < self.shape)).all(axis=1)
         found = np.full(len(positions), UNKNOWN, np.int8)
         found[inside] = self.state[tuple(voxels[inside].astype(np.int64).T)]
         return found
 
-    def distances(self) -> DistanceField:
-        """Compute Euclidean distances to occupied voxels, and to voxels that are not free; exact between centres."""
+    def distances(self, obstacles: ArrayLike | None = None) -> DistanceField:
+        """Compute Euclidean distances to the surface, to occupied voxels, and to voxels that are not free.
+
+        Parameters
+        ----------
+        obstacles : (K, 3) or (K, 2, 3) array_like, optional
+            Known obstacles that the map lacks, world, m: points, or boxes with the lower corner first. Voxels that they touch
+            count as occupied; outside the grid they are ignored. Others raise a ValueError.
+        """
         from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
         def to_nearest(others: Bools, beyond: bool) -> Floats32:
@@ -161,12 +152,41 @@ class Grid:
             mask = np.pad(others, 1, constant_values=not beyond)
             return distance_transform_edt(mask, self.voxel_size)[1:-1, 1:-1, 1:-1].astype(np.float32)
 
-        occupied = self.occupied
-        occupied_m = np.full(self.shape, np.inf, np.float32)
+        stamped = checked_obstacles(obstacles)
+        points, normals = self._surface()
+        state, rows = self.state.copy(), np.full(self.shape, -1)
+        rows[self.occupied] = np.arange(len(points))
+        corners = np.floor((stamped - self.origin) / self.voxel_size).clip(-1, self.shape).astype(np.int64)
+        for k, (first, last) in enumerate(corners):
+            touched = tuple(map(slice, first.clip(0), last + 1))
+            state[touched], rows[touched] = OCCUPIED, len(points) + k
+        boxes = np.concatenate([np.stack([points, points], axis=1), stamped])
+        normals = np.concatenate([normals, np.zeros((len(stamped), 3))])
+        occupied, free = state == OCCUPIED, state == FREE
+        occupied_m, surface_m = np.full((2, *self.shape), np.inf, np.float32)
         if occupied.any():
-            occupied_m = np.where(occupied, -to_nearest(occupied, True), to_nearest(~occupied, False))
+            away_m, nearest = distance_transform_edt(~occupied, self.voxel_size, return_indices=True)
+            occupied_m = np.where(occupied, -to_nearest(occupied, True), away_m.astype(np.float32))
+            nearest, centres = rows[tuple(nearest)], self.centres().reshape(*self.shape, 3)
+            for x, columns in enumerate(centres):  # memory
+                surface_m[x] = distances_to_boxes(
+                    columns, boxes, normals, nearest[x], free[x], self.voxel_size
+                )
         error_m = math.sqrt(3) / 2 * self.voxel_size + self.position_error_m
-        return DistanceField(occupied_m, to_nearest(self.free, True), error_m)
+        of_space = state != UNKNOWN, occupied_m, to_nearest(free, True), surface_m
+        return DistanceField(self.origin, self.voxel_size, *of_space, error_m)
+
+    def _surface(self) -> tuple[Floats, Floats]:
+        """Return points (N, 3), world, m, on the surface in the occupied voxels, and its unit normals, 0 where unknown."""
+        voxels, distance_m = np.argwhere(self.occupied), np.nan_to_num(self.distance_m[self.occupied])
+        padded = np.pad(self.distance_m, 1, constant_values=np.nan)
+        normals = np.zeros(voxels.shape)
+        for axis in range(3):
+            line = [padded[tuple((voxels + 1 + step * np.eye(3, dtype=int)[axis]).T)] for step in (-1, 0, 1)]
+            slopes = np.diff(line, axis=0)  # one of both is unknown where the surface ends
+            normals[:, axis] = np.nansum(slopes, axis=0) / np.isfinite(slopes).sum(axis=0).clip(1)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+        return self.centres(self.occupied) - distance_m[:, None] * normals, normals
 
     def costmap(self, wheels: Wheels | None = None) -> Costmap:
         """Compute heights of the ground, and costs for a vehicle with these limits; by default, those of a car."""
@@ -273,7 +293,8 @@ class Grid:
 def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | DistanceField) -> None:
     """Write costs or distances of a grid to an ``.npz``, by name, with its `origin` and `voxel_size`."""
     checked_suffix(path, (".npz",), "arrays of a grid")
-    write_arrays(path, {"origin": grid.origin, "voxel_size": grid.voxel_size, **vars(found)}, compressed=True)
+    arrays = {name: values for name, values in vars(found).items() if not name.startswith("_")}
+    write_arrays(path, {"origin": grid.origin, "voxel_size": grid.voxel_size, **arrays}, compressed=True)
 
 
 def _planes(height: Floats32, size: float) -> tuple[Floats32, Floats32]:

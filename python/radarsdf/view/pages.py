@@ -10,15 +10,17 @@ import numpy as np
 from radarsdf.arrays import Floats
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
 from radarsdf.checks import check
+from radarsdf.grids.grid import Grid
+from radarsdf.scans import Scan
 from radarsdf.view.quantities import key, paragraph, table
-from radarsdf.view.scene import add_path
+from radarsdf.view.scene import POINTS, SCAN_COLORS, add_path
 from radarsdf.view.serving import Page, framing_pose, set_initial_camera
+from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
 from radarsdf.view.surface import glb, lightness_of, shaded, thinned
 
 if TYPE_CHECKING:
     import trimesh
 
-_SURFACE_COLOR, _PATH_COLOR = (150, 160, 170), (0, 190, 255)
 _MAX_VERTICES = 500_000
 _MAX_LISTED = 12  # changes
 _NOTES = {"unseen": ": not observed by the other map", "gone": ": of the earlier map"}
@@ -31,29 +33,36 @@ def centre_of(region: Region) -> str:
     return "({:.1f}, {:.1f}, {:.1f}) m".format(*region.box.mean(axis=0))
 
 
-class GrowingView(Page):
-    """Serves the current surface and trajectory."""
+class GrowingView(Page, Sink):
+    """Serves the current surface, trajectory, scan and space."""
 
     def __init__(self, **address: Any) -> None:
         super().__init__(**address)
         self._start()
-        self._origin: Floats | None = None
+        self._framed = False
 
-    def show(self, mesh: trimesh.Trimesh, path: Floats) -> None:
-        """Show a mesh and the sensor positions (F, 3), world, m, instead of the previous ones."""
-        if len(mesh.faces) == 0:
-            return
-        vertices = np.asarray(mesh.vertices, np.float64)
-        server = self._server
-        if self._origin is None:  # origin of the page, which computes in float32
-            self._origin = path[0].copy()
-            set_initial_camera(server, framing_pose(vertices - self._origin))
-        local, faces = (vertices - self._origin).astype(np.float32), np.asarray(mesh.faces, np.uint32)
+    def show_scan(self, scan: Scan, time_s: float) -> None:  # noqa: ARG002
+        world = np.concatenate([scan.T_world_sensor[None, :3, 3], scan.world_points])
+        self._add_points("/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
+
+    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:  # noqa: ARG002
+        local, server, shade = self._local(mesh.vertices), self._server, lightness_of(mesh.vertex_normals)
+        if not self._framed:
+            self._framed = True
+            set_initial_camera(server, framing_pose(local))
+        data = glb(local, mesh.faces, shaded(uncertainty_colors(mesh), shade))
         with server.atomic():
-            style = {"color": _SURFACE_COLOR, "side": "double", "flat_shading": True}
-            server.scene.add_mesh_simple("/surface", local, faces, **style)
+            server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
             if len(path) > 1:
-                add_path(server, "/path", path - self._origin, _PATH_COLOR)
+                add_path(server, "/path", self._local(path), PATH_COLOR)
+
+    def show_grid(self, grid: Grid, time_s: float) -> None:  # noqa: ARG002
+        free = self._local(grid.centres(grid.free))
+        self._add_points("/free space", free, FREE_COLOR, 0.2 * grid.voxel_size)
+
+    def _add_points(self, name: str, local: Floats, color: Any, size_m: float) -> None:
+        points, colors = local.astype(np.float32), np.full(local.shape, color, np.uint8)
+        self._server.scene.add_point_cloud(name, points, colors, point_size=size_m, **POINTS)
 
 
 class ChangesView(Page):

@@ -33,7 +33,7 @@ _DRAG_POINTS = 30_000
 _POINT_SIZE = 1.4  # size in vertex spacings, which leaves no holes between points
 _STYLES = {"measured": ("circle", 0.25), "predicted": ("diamond", 0.2)}  # size, m
 # In float16, points would lie on a grid of 3 cm at 60 m.
-_POINTS = {"point_shading": "flat", "precision": "float32"}
+POINTS = {"point_shading": "flat", "precision": "float32"}
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class Canvas:
                 point_shape="circle",
                 point_size=_POINT_SIZE * spacing_m,
                 visible=False,
-                **_POINTS,
+                **POINTS,
             )
 
     def show_scan(self, state: State) -> None:
@@ -247,7 +247,7 @@ class ScanClouds:
             self.nodes[what].points, self.nodes[what].colors = local, colors
             return
         shape, size_m = _STYLES[what]
-        options = _POINTS | {"point_shape": shape, "point_size": size_m}
+        options = POINTS | {"point_shape": shape, "point_size": size_m}
         self.nodes[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
 
 

@@ -31,6 +31,7 @@ from radarsdf.extras import require
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+LOCALHOST = "127.0.0.1"
 _FIRST_PORT, _PORTS_TRIED = 8080, 100
 WAIT_STEP_S = 0.2  # step of waits in the main thread: on Windows, Ctrl-C does not interrupt an endless wait
 FOV_RAD = 0.85  # vertical field of view: less than viser's, so that walls stay upright
@@ -44,9 +45,9 @@ def require_viser() -> None:
     require("viser", what="the viewer needs")
 
 
-def free_port(host: str, port: int | None) -> int:
-    """Return `port`, or the first free one from 8080. Raise an OSError if there is none, for which viser would wait forever."""
-    candidates = range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED)
+def free_port(host: str, port: int | None, first: int | None = None) -> int:
+    """Return `port`, or the first free one from `first`, 8080. Raise an OSError if there is none, for which viser would wait forever."""
+    candidates = range(first := first or _FIRST_PORT, first + _PORTS_TRIED)
     if port is not None:
         candidates = range(whole_number(port, "--port", 0, 65535), port + 1)
     for candidate in candidates:
@@ -161,20 +162,21 @@ def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: fl
             answers += 1
 
 
+def wait() -> None:
+    while True:
+        time.sleep(WAIT_STEP_S)
+
+
 class Page:
     """A page served until it is stopped. Raises an OSError for a taken port before any work."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int | None = None) -> None:
+    def __init__(self, host: str = LOCALHOST, port: int | None = None) -> None:
         require_viser()
         self.host = host
         self.port = free_port(host, port)
 
     def _start(self) -> None:
         self._server: Any = start_server(self.host, self.port)
-
-    def wait(self) -> None:
-        while True:
-            time.sleep(WAIT_STEP_S)
 
     def stop(self) -> None:
         stop_server(self._server)

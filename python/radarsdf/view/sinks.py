@@ -1,0 +1,242 @@
+"""What a growing map shows, to viewers and files: Foxglove (WebSocket, MCAP) and rerun (web viewer, .rrd), both extras."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import shutil
+import subprocess
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import quote
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from radarsdf.arrays import Array, Bytes, Floats
+from radarsdf.extras import require
+from radarsdf.grids.grid import Grid
+from radarsdf.io.files import checked_suffix, whole_file
+from radarsdf.scans import Scan
+from radarsdf.view.quantities import Scale
+from radarsdf.view.serving import LOCALHOST, free_port
+
+if TYPE_CHECKING:
+    import trimesh
+
+PATH_COLOR, FREE_COLOR = (0, 190, 255), (90, 160, 120)
+# RGBA of free, occupied and unknown voxels.
+_STATE_COLORS = np.array([[*FREE_COLOR, 40], [200, 60, 40, 255], [0, 0, 0, 0]], np.uint8)
+_CELL = [(name, "u1") for name in ("red", "green", "blue", "alpha")]
+
+
+class Sink(ABC):
+    """A page, a viewer or a file. Positions are in the world frame, m. Methods may be called from several threads."""
+
+    origin: Floats | None = None  # (3,) world, m: viewers compute in float32
+
+    @abstractmethod
+    def show_scan(self, scan: Scan, time_s: float) -> None:
+        """Show the returns of a scan, and the pose of its radar."""
+
+    @abstractmethod
+    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:
+        """Replace the mesh, coloured by its uncertainty, and the sensor positions (F, 3)."""
+
+    @abstractmethod
+    def show_grid(self, grid: Grid, time_s: float) -> None:
+        """Replace occupied and free space."""
+
+    def _local(self, positions: Floats) -> Floats:
+        """Return positions (N, 3) relative to :attr:`origin`, whole kilometres near the first one."""
+        if self.origin is None:
+            self.origin = np.round(positions[0], -3)
+        return positions - self.origin
+
+
+class FoxgloveSink(Sink):
+    """Logs messages of Foxglove to the files and servers of a context. The world frame is ``map``, as in ROS."""
+
+    def __init__(self, foxglove: Any, context: Any) -> None:
+        self._foxglove, self._of, self._context = foxglove, foxglove.messages, context
+        self._channels: dict[str, Any] = {}
+
+    def show_scan(self, scan: Scan, time_s: float) -> None:
+        of, frame, T = self._of, _frame_of(scan), scan.T_world_sensor
+        position, rotation = self._placed(T[:3, 3], T[:3, :3])
+        moved = {"child_frame_id": frame, "translation": position, "rotation": rotation}
+        self._log("/tf", of.FrameTransform, time_s, parent_frame_id="map", **moved)
+        pose = of.Pose(position=position, orientation=rotation)
+        self._log(f"/pose/{frame}", of.PoseInFrame, time_s, frame_id="map", pose=pose)
+        columns = dict(zip("xyz", scan.points.T, strict=True))
+        if scan.intensities is not None:
+            columns["intensity"] = scan.intensities
+        rows = np.rec.fromarrays(list(columns.values()), [(name, "<f4") for name in columns])
+        self._log_cells(f"/returns/{frame}", of.PointCloud, time_s, rows, frame_id=frame)
+
+    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:
+        of, positions = self._of, self._local(path)
+        line = {"pose": self._pose(self.origin), "thickness": 3.0, "scale_invariant": True}
+        lines = of.LinePrimitive(**line).encode() + _points(5, positions)
+        lines += _points(6, np.append(PATH_COLOR, 255)[None] / 255)
+        # Encoded by NumPy: objects for each vertex take a quarter of a second for 50,000.
+        colors = np.column_stack([uncertainty_colors(mesh), np.full(len(mesh.vertices), 255)]) / 255
+        triangles = of.TriangleListPrimitive(pose=line["pose"]).encode() + _points(4, colors)
+        triangles += _points(2, self._local(mesh.vertices)) + _field(5, mesh.faces.astype("<u4").tobytes())
+        entity = of.SceneEntity(timestamp=self._stamp(time_s), frame_id="map", id="surface").encode()
+        entity = _field(2, entity + _field(11, lines) + _field(12, triangles))
+        self._log("/surface", of.SceneUpdate, time_s, entity)
+
+    def show_grid(self, grid: Grid, time_s: float) -> None:
+        of, size_m, cells = self._of, grid.voxel_size, _cells(grid.state)
+        place = {"frame_id": "map", "pose": self._pose(grid.origin), "column_count": cells.shape[2]}
+        rows = {"row_count": cells.shape[1], "cell_size": of.Vector3(x=size_m, y=size_m, z=size_m)}
+        self._log_cells("/free_space", of.VoxelGrid, time_s, cells, **place, **rows)
+        with contextlib.suppress(ValueError):  # without ground
+            size = of.Vector2(x=size_m, y=size_m)
+            self._log_cells("/grid", of.Grid, time_s, _cells(grid.flat().state), **place, cell_size=size)
+
+    def _log_cells(self, topic: str, schema: Any, time_s: float, cells: Array, **values: Any) -> None:
+        """Log an array of records (N,), (Y, X) or (Z, Y, X)."""
+        of, layout = self._of, cast(Any, cells.dtype.fields)
+        kinds = {1: of.PackedElementFieldNumericType.Uint8, 4: of.PackedElementFieldNumericType.Float32}
+        parts = [
+            {"name": name, "offset": at, "type": kinds[kind.itemsize]} for name, (kind, at) in layout.items()
+        ]
+        fields = [of.PackedElementField(**part) for part in parts]
+        names = ["slice_stride", "row_stride", "cell_stride"] if cells.ndim > 1 else ["point_stride"]
+        values |= dict(zip(names[-cells.ndim :], cells.strides, strict=True))
+        self._log(topic, schema, time_s, fields=fields, data=cells.tobytes(), **values)
+
+    def _log(self, topic: str, schema: Any, time_s: float, encoded: bytes = b"", **values: Any) -> None:
+        if topic not in self._channels:
+            options = {"message_encoding": "protobuf", "context": self._context}
+            self._channels[topic] = self._foxglove.Channel(topic, schema=schema.get_schema(), **options)
+        encoded = encoded or schema(timestamp=self._stamp(time_s), **values).encode()
+        self._channels[topic].log(encoded, log_time=round(1e9 * time_s))
+
+    def _stamp(self, time_s: float) -> Any:
+        return self._of.Timestamp(sec=int(time_s // 1), nsec=int(time_s % 1 * 1e9))
+
+    def _placed(self, position: Any, R: Any = None) -> tuple[Any, Any]:
+        x, y, z, w = (0.0, 0.0, 0.0, 1.0) if R is None else Rotation.from_matrix(R).as_quat().tolist()
+        vector = self._of.Vector3(**dict(zip("xyz", position.tolist(), strict=True)))
+        return vector, self._of.Quaternion(x=x, y=y, z=z, w=w)
+
+    def _pose(self, position: Any) -> Any:
+        return self._of.Pose(**dict(zip(("position", "orientation"), self._placed(position), strict=True)))
+
+
+class RerunSink(Sink):
+    """Logs to a stream of rerun."""
+
+    def __init__(self, rerun: Any, stream: Any) -> None:
+        self._rerun, self._stream = rerun, stream
+        stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def show_scan(self, scan: Scan, time_s: float) -> None:
+        T, name = scan.T_world_sensor, f"map/{_frame_of(scan)}"
+        pose = self._rerun.Transform3D(translation=self._local(T[None, :3, 3])[0], mat3x3=T[:3, :3])
+        self._log(time_s, {name: pose, f"{name}/returns": self._rerun.Points3D(scan.points, radii=0.05)})
+
+    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:
+        style = {"vertex_normals": mesh.vertex_normals, "vertex_colors": uncertainty_colors(mesh)}
+        local = {"vertex_positions": self._local(mesh.vertices), "triangle_indices": mesh.faces}
+        line = self._rerun.LineStrips3D([self._local(path)], colors=[PATH_COLOR])
+        self._log(time_s, {"map/trajectory": line, "map/surface": self._rerun.Mesh3D(**local, **style)})
+
+    def show_grid(self, grid: Grid, time_s: float) -> None:
+        style = {"colors": [FREE_COLOR], "radii": 0.2 * grid.voxel_size}
+        self._log(
+            time_s, {"map/free_space": self._rerun.Points3D(self._local(grid.centres(grid.free)), **style)}
+        )
+
+    def _log(self, time_s: float, entities: dict[str, Any]) -> None:
+        self._stream.set_time("time", timestamp=time_s)  # of this thread
+        for name, entity in entities.items():
+            self._stream.log(name, entity)
+
+
+@contextlib.contextmanager
+def foxglove_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
+    """Yield a sink that writes an MCAP file whole or not at all; without a path, one that serves this machine only, and its address."""
+    foxglove = require("foxglove", what="Foxglove and MCAP files need")
+    context = foxglove.Context()
+    if path is not None:
+        checked_suffix(path, [".mcap"], "Foxglove")
+        with whole_file(path) as file, foxglove.open_mcap(file, context=context):
+            yield FoxgloveSink(foxglove, context), ""
+        return
+    port = free_port(LOCALHOST, None, 8765)
+    server = foxglove.start_server(name="radarsdf", host=LOCALHOST, port=port, context=context)
+    try:
+        yield FoxgloveSink(foxglove, context), f"ws://{LOCALHOST}:{port}"
+    finally:
+        server.stop()
+
+
+@contextlib.contextmanager
+def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
+    """Yield a sink that writes an .rrd file whole or not at all; without a path, a web viewer for this machine only, and its address."""
+    rerun = require("rerun", what="rerun needs")
+    stream = rerun.RecordingStream("radarsdf")
+    if path is not None:
+        checked_suffix(path, [".rrd"], "rerun")
+        with whole_file(path) as file, TemporaryDirectory(dir=path.absolute().parent) as folder:
+            stream.save(growing := Path(folder) / "growing.rrd")
+            yield RerunSink(rerun, stream), ""
+            stream.disconnect()
+            with growing.open("rb") as written:
+                shutil.copyfileobj(written, file)
+        return
+    port = free_port(LOCALHOST, None, 9876)
+    page = free_port(LOCALHOST, None, port + 1)
+    words = ["--serve-web", "--bind", LOCALHOST, "--port", str(port), "--web-viewer-port", str(page)]
+    # The SDK itself would serve to all machines, and `python -m rerun` is the parent of the viewer. Ctrl-C is not for it.
+    package = Path(importlib.import_module("rerun_cli").__file__ or "").parent
+    binary = shutil.which("rerun", path=f"{package}{os.pathsep}{package / 'Rerun.app/Contents/MacOS'}")
+    quiet: dict[str, Any] = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+    with subprocess.Popen([binary or "rerun", *words], start_new_session=True, **quiet) as server:
+        try:
+            stream.connect_grpc(url := f"rerun+http://{LOCALHOST}:{port}/proxy")
+            yield RerunSink(rerun, stream), f"http://{LOCALHOST}:{page}?url={quote(url)}"
+            stream.disconnect()
+        finally:
+            server.terminate()
+
+
+def uncertainty_colors(mesh: trimesh.Trimesh) -> Bytes:
+    """Return the sRGB colours (V, 3) of the vertices of a mesh by their uncertainty."""
+    uncertainty_m = np.asarray(mesh.vertex_attributes["uncertainty_m"])
+    return Scale.of(uncertainty_m)(uncertainty_m)
+
+
+def _frame_of(scan: Scan) -> str:
+    return "radar" if scan.sensor is None else f"radar_{scan.sensor}"
+
+
+def _cells(state: Array) -> Array:
+    """Return states (X, Y) or (X, Y, Z) as colours, (Y, X) or (Z, Y, X): x varies fastest."""
+    return _STATE_COLORS[state.T].view(_CELL)[..., 0]
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """Encode a field of Protocol Buffers: a message or packed numbers."""
+    size, length = len(content), []
+    while size > 127:
+        length.append(size & 127 | 128)
+        size >>= 7
+    return bytes([number << 3 | 2, *length, size]) + content
+
+
+def _points(number: int, values: Array) -> bytes:
+    """Encode rows (N, K) as a repeated field of messages of K doubles, such as Point3 and Color."""
+    count = values.shape[1]
+    rows = np.zeros(len(values), [("head", "u1", 2), ("values", [("tag", "u1"), ("value", "<f8")], count)])
+    rows["head"] = number << 3 | 2, 9 * count
+    rows["values"]["tag"], rows["values"]["value"] = 8 * np.arange(1, count + 1) + 1, values
+    return rows.tobytes()
