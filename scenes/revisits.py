@@ -35,9 +35,7 @@ Floats = NDArray[np.float64]
 _FRAMES = 24  # scans of another day
 _ASIDE_M = 1.0  # paths are free of solids to 1.2 m on each side
 _LAYOUT, _TRAJECTORY, _DAY = 2**31 + 1, 2**31 + 2, 2**31 + 4  # streams of random numbers that no scan uses
-_STAYS_M = (
-    10.0  # radius of solids such as façades and the walls of halls, without which the place would be another
-)
+_STAYS_M = 8.0  # radius of solids such as façades and the walls of halls, which stay
 _SHORT = replace(HUGIN_A4, max_range_m=20.0)
 _ELSEWHERE = 500  # added to the seed of a place for another one of its kind
 
