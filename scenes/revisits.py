@@ -166,7 +166,7 @@ class Sessions:
 
 def sessions(kind: str, seed: int) -> Sessions:
     """Simulate the sessions of a place of `PLACES`, each on another day."""
-    here, elsewhere = (PLACES[kind](seed=own) for own in (seed, seed + _ELSEWHERE))
+    here, elsewhere = (PLACES[kind](seed=own, frames=30) for own in (seed, seed + _ELSEWHERE))
     stretches = [(2 * i / 7, (2 * i + 3) / 7) for i in range(3)]  # 3/7 of the path; a third is shared
     together = [another_day(here, 10 * seed + i, stretch=part) for i, part in enumerate(stretches)]
     return Sessions(together, [together[0], another_day(elsewhere, 10 * seed + 3, stretch=stretches[0])])
