@@ -140,7 +140,7 @@ def _ours(radar_map: RadarMap, day: Simulation, motion: MeasuredMotion) -> Row:
     except ValueError as error:
         why = {"verdict": "refused"} if isinstance(error, lost_error) else {"why_not": str(error)}
         return {"method": _OURS} | why
-    row = {"method": _OURS} | judged(found.poses, day.poses)
+    row: Row = {"method": _OURS} | judged(found.poses, day.poses)
     if np.isfinite(found.poses[0]).all():
         with timed() as tracking:
             locate(radar_map, day.points, guess=found.poses[0], **scans)
