@@ -43,10 +43,7 @@ _MOST_M, _MOST_DEG = 0.5, 3.0  # errors of a place that is found
 _GUESS_M, _GUESS_DEG = 2.0, 10.0  # errors of the guess for small-gicp
 _FEWEST_INLIERS = 5  # the default of map-closures, also for kiss-matcher, whose example has none
 _KISS_VOXELS_M = (0.3, 0.5, 1.0)  # the answer with most inliers counts
-_DENSITY_CELL_M, _THINNED_M = (
-    0.5,
-    0.4,
-)  # map-closures counts returns in cells, and finds less if none are dropped
+_DENSITY_CELL_M, _THINNED_M = 0.5, 0.4  # of map-closures, which counts returns and finds less in all of them
 _MAP_FRAMES = dict.fromkeys(PLACES, 60) | {"astyx": 24, "facade": 30, "wall": 40, "forest": 40, "tunnel": 40}
 
 CASES: dict[str, Callable[[Simulation], dict[str, Any]]] = {
