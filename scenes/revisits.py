@@ -85,17 +85,15 @@ def another_day(
     xyz = np.stack([np.interp(at, np.arange(last + 1), first.poses[:, k, 3]) for k in range(3)], axis=1)
     rotations = Slerp(np.arange(last + 1), Rotation.from_matrix(first.poses[:, :3, :3]))(at)
     axes = rotations.as_matrix()
-    swing = np.sin(np.linspace(0, [[3], [4]], _FRAMES, axis=-1)[:, 0] + rng.uniform(0, 6, (2, 1)))
+    swing = np.sin(np.outer([3, 4], np.linspace(0, 1, _FRAMES)) + rng.uniform(0, 6, (2, 1)))
     aside_m = _ASIDE_M * rng.choice([-1, 1]) * (0.7 + 0.3 * swing[0])
     moved = xyz[:, :2] + aside_m[:, None] * axes[:, :2, 1]
     if first.scene.terrain is not None:
         height = first.scene.terrain.height
         xyz[:, 2] += height(moved) - height(xyz[:, :2])
     steps = np.gradient(xyz[:, :2], axis=0)
-    looks_along = (
-        np.median(np.abs((axes[:, :2, 0] * steps).sum(axis=1)) / np.linalg.norm(steps, axis=1)) > 0.5
-    )
-    yaw = 0.05 * swing[1] + (np.pi if reverse and looks_along else 0.0)
+    along = np.abs((axes[:, :2, 0] * steps).sum(axis=1)) / np.linalg.norm(steps, axis=1)
+    yaw = 0.05 * swing[1] + (np.pi if reverse and np.median(along) > 0.5 else 0.0)
     poses = np.tile(np.eye(4), (_FRAMES, 1, 1))
     poses[:, :3, :3] = (Rotation.from_rotvec(np.outer(yaw, [0, 0, 1])) * rotations).as_matrix()
     poses[:, :2, 3], poses[:, 2, 3] = moved, xyz[:, 2]
