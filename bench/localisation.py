@@ -97,17 +97,17 @@ def _thinned(points: Floats) -> Floats:
     return points[first]
 
 
-def _gicp(submap: Submap, guess: Floats) -> Floats | None:
+def _gicp(submap: Submap, guess: Floats, may_refuse: bool = False) -> Floats | None:
     found = importlib.import_module("small_gicp").align(
         submap.vertices, submap.returns, init_T_target_source=guess, max_iterations=100
     )
-    return np.asarray(found.T_target_source) if found.converged else None
+    return np.asarray(found.T_target_source) if found.converged or not may_refuse else None
 
 
 PEERS: dict[str, Callable[[Submap], Floats | None]] = {
     "kiss-matcher": _kiss_matcher,
     "map-closures": _map_closures,
-    _GUESSING: lambda submap: _gicp(submap, submap.guess),
+    _GUESSING: lambda submap: _gicp(submap, submap.guess, may_refuse=True),
 }
 """Each returns T_world_odometry (4, 4), or None if it refuses."""
 
