@@ -35,8 +35,10 @@ def timed() -> Iterator[Taken]:
     """Measure the time of a block."""
     taken = Taken()
     wall_s, cpu_s = time.perf_counter(), time.process_time()
-    yield taken
-    taken.wall_s, taken.cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+    try:
+        yield taken
+    finally:
+        taken.wall_s, taken.cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
 
 
 @contextmanager
