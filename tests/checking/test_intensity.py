@@ -108,7 +108,7 @@ def test_the_ground_is_at_the_mode_of_returns_below_the_sensor():
     (found,) = check_ground(checked_input(scans, [np.eye(4), turned]))
     assert found.severity == "note"
     assert found.evidence == (
-        f"{20 / 1960:.1%} of the returns closer than 25 m lie clearly below the ground, which is 1.4 m below the sensor."
+        f"{20 / 1960:.1%} of returns within 25 m are clearly below the ground, 1.4 m below the sensor."
     )
     assert list(check_ground(checked_input([np.concatenate([ground, above, reflected])], [np.eye(4)]))) == []
     assert list(check_ground(checked_input([np.concatenate([ground[:50], deep, deep])], [np.eye(4)]))) == []

@@ -20,11 +20,12 @@ from radarsdf.poses.doppler import (
     upright,
 )
 from radarsdf.poses.drive import Drive, rates_of, track_drive
+from radarsdf.poses.estimate import _by_biases
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.posed import PosedScans, pose_sigmas
-from radarsdf.poses.refine import _by_biases
+from radarsdf.poses.registration import PlaneMap, _removed_share, apart_m, thin
 from radarsdf.poses.rigid import (
     aligned,
     between,
@@ -40,7 +41,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import Tracked, Tracker, _apart_m, _removed_share, begin_segment, thin
+from radarsdf.poses.tracking import Tracked, begin_segment
 from radarsdf.poses.verdict import Verdict, _crowding, _gains
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
@@ -66,7 +67,7 @@ def test_increments_lead_from_pose_to_pose():
     assert_allclose(turned_by(first, shifted), 1.0)
     a, b = np.random.default_rng(0).normal(size=(2, 4, 3))
     assert_allclose(np.einsum("nij,nj->ni", skew(a), b), np.cross(a, b))
-    assert_allclose(_apart_m(shifted, first, 2.0)[0], np.linalg.norm(increments(first, shifted)[0, :3]) + 2)
+    assert_allclose(apart_m(shifted, first, 2.0)[0], np.linalg.norm(increments(first, shifted)[0, :3]) + 2)
     covariance = spread(1, 6)
     R, both = whole[:3, :3], np.kron(np.eye(2), whole[:3, :3])
     assert_allclose(covariance_in(covariance[None], R)[0], both @ covariance @ both.T)
@@ -357,7 +358,7 @@ def test_motions_of_a_tracked_drive():
 
 def test_information_independent_of_the_pose_is_subtracted():
     """Of 100 along x at the pose and 40 on average near it, 60 remain."""
-    tracker = Tracker(0.4, FitConfig().returns, 1)
+    planes = PlaneMap(0.4)
     asked = []
 
     def agreement(_, pose, __):
@@ -365,14 +366,14 @@ def test_information_independent_of_the_pose_is_subtracted():
         along = {5: 100.0, 5.8: 70, 4.2: 30, 6.6: 50, 3.4: 10}[round(pose[0, 3], 6)]
         return np.diag([along, 1e6, 1e6, 1e6, 1e6, 1e6]), np.zeros(6), np.zeros((6, 6)), 1.0
 
-    tracker._planes = [None, SimpleNamespace(agreement=agreement)]
+    planes.fine = SimpleNamespace(agreement=agreement)
     prior, pose = np.eye(6), transform(np.zeros(3), np.array([5.0, 0, 0]))
     covariance = np.diag([1 / 101] + [1e-6] * 5)
-    found = tracker._discount_chance(None, pose, prior, covariance)
+    found = planes._discount_chance(None, pose, prior, covariance)
     assert_allclose(found, np.diag([1 / 61] + [1e-6] * 5), rtol=1e-9)
     assert len(asked) == 5
     sure = (0.05 * 0.8) ** 2 * 0.99  # in cells of 0.8 m, this needs no returns
-    assert tracker._discount_chance(None, pose, sure * prior, covariance) is covariance
+    assert planes._discount_chance(None, pose, sure * prior, covariance) is covariance
 
 
 def test_gains_equal_a_brute_force_search():

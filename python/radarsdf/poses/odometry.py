@@ -20,11 +20,11 @@ from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance, turns_fast
 from radarsdf.poses.drive import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
+from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import UnusableGyroscopeError
 from radarsdf.poses.imu import Inertial, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import steps
 from radarsdf.poses.tracking import Tracked
 from radarsdf.returns.rays import within_ranges
@@ -124,42 +124,17 @@ def odometry(
     """
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
-    for _, checked in radars:
-        if checked.times_s is None:
-            msg = "times_s are missing: the time of each scan, s"
-            raise ValueError(msg)
-        checked.check_intervals()
-    if imu is None and isinstance(points, Scans):
-        imu = points.imu
     with ThreadPool(config.num_threads) as pool:
-        compared = [_compare_doppler(rows, checked, config, pool.num_threads) for rows, checked in radars]
-        _, scans, times_s, velocities = join_radars(rig, [each.measured for each in compared])
-        assert times_s is not None
-        notes = [note for each in compared for note in each.notes]
-        # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
-        of_radars = [each.measured.rows for each in compared if each.measured.velocities is not None]
-        radar = max(of_radars, key=len, default=np.arange(len(times_s)))
-        own = None if velocities is None else velocities.select(radar)
-        inertial = Inertial.of(imu, own, times_s, radars[0][1].begin_s, radar)
-        yaws = compared[0].yaws if rig is None else None
-        drive = Drive(scans, times_s, velocities, inertial.gyroscope, yaws=yaws, rig=rig)
-        try:
-            drive, tracked = track_drive(drive, config, pool.num_threads, progress)
-        except UnusableGyroscopeError as why:
-            inertial = inertial.without(why)
-            drive = dataclasses.replace(drive, gyroscope=None)
-            drive, tracked = track_drive(drive, config, pool.num_threads, progress)
-        notes += inertial.notes
+        drive, tracked, compared, inertial, notes = track_scans(
+            points, doppler_mps, times_s, imu, config, pool.num_threads, progress
+        )
+        velocities = drive.velocities
         notes += _check_observed(tracked, drive, notes)
         segments = np.array([found.segment for found in tracked])
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
         if velocities is not None:
-            known = [each.consistency for each in compared if each.measured.velocities is not None]
-            # Radars of a rig move together: the best known one decides.
-            least = min(known, key=lambda one: len(one.doubts or ()))
-            covariance = least.widened(poses, covariance, segments, drive)
+            covariance = widened(compared, poses, covariance, segments, drive)
         if inertial.alignment is not None:
             poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -174,7 +149,7 @@ def odometry(
         "gyroscope": gyroscope is not None,
         "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
-        "moving": sum(checked.moving for _, checked in radars),
+        "moving": sum(each.moving for each in compared),
         "notes": notes,
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
@@ -182,17 +157,76 @@ def odometry(
     return Odometry(poses, covariance, segments, report)
 
 
-class _Compared(NamedTuple):
+class TrackedScans(NamedTuple):
+    """Scans of a drive, tracked without poses."""
+
+    drive: Drive
+    tracked: list[Tracked]
+    compared: list[ComparedRadar]
+    inertial: Inertial
+    notes: list[str]
+
+
+def track_scans(
+    points: Iterable[ArrayLike] | Scans,
+    doppler_mps: Sequence[ArrayLike] | None,
+    times_s: ArrayLike | None,
+    imu: Imu | None,
+    config: FitConfig,
+    num_threads: int,
+    progress: bool | None,
+) -> TrackedScans:
+    """Check scans, compare their Doppler with their returns, and track them. Arguments and errors are those of :func:`odometry`."""
+    rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
+    for _, checked in radars:
+        if checked.times_s is None:
+            msg = "times_s are missing: the time of each scan, s"
+            raise ValueError(msg)
+        checked.check_intervals()
+    if imu is None and isinstance(points, Scans):
+        imu = points.imu
+    compared = [_compare_doppler(rows, checked, config, num_threads) for rows, checked in radars]
+    _, scans, times, velocities = join_radars(rig, [each.measured for each in compared])
+    assert times is not None
+    notes = [note for each in compared for note in each.notes]
+    # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
+    of_radars = [each.measured.rows for each in compared if each.measured.velocities is not None]
+    radar = max(of_radars, key=len, default=np.arange(len(times)))
+    own = None if velocities is None else velocities.select(radar)
+    inertial = Inertial.of(imu, own, times, radars[0][1].begin_s, radar)
+    yaws = compared[0].yaws if rig is None else None
+    drive = Drive(scans, times, velocities, inertial.gyroscope, yaws=yaws, rig=rig)
+    try:
+        drive, tracked = track_drive(drive, config, num_threads, progress)
+    except UnusableGyroscopeError as why:
+        inertial = inertial.without(why)
+        drive = dataclasses.replace(drive, gyroscope=None)
+        drive, tracked = track_drive(drive, config, num_threads, progress)
+    return TrackedScans(drive, tracked, compared, inertial, [*notes, *inertial.notes])
+
+
+class ComparedRadar(NamedTuple):
     """A radar, whose Doppler was compared with its returns."""
 
     measured: MeasuredScans
     yaws: Floats | None  # see :class:`Drive`
     sign: int
     consistency: Consistency
+    moving: int  # number of moving returns left out
     notes: list[str]
 
 
-def _compare_doppler(rows: Ints, checked: CheckedScans, config: FitConfig, num_threads: int) -> _Compared:
+def widened(
+    compared: Sequence[ComparedRadar], poses: Floats, covariance: Floats, segments: Ints, drive: Drive
+) -> Floats:
+    """Widen covariances (F, 6, 6) of poses by what Doppler and returns leave open."""
+    known = [each.consistency for each in compared if each.measured.velocities is not None]
+    # Radars of a rig move together: the best known one decides.
+    least = min(known, key=lambda one: len(one.doubts or ()))
+    return least.widened(poses, covariance, segments, drive)
+
+
+def _compare_doppler(rows: Ints, checked: CheckedScans, config: FitConfig, num_threads: int) -> ComparedRadar:
     times_s, velocities, sign, yaws = checked.times_s, checked.velocities, 1, None
     assert times_s is not None
     if velocities is not None:
@@ -211,7 +245,14 @@ def _compare_doppler(rows: Ints, checked: CheckedScans, config: FitConfig, num_t
             times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
             velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
     measured = MeasuredScans(rows, scans, times_s, velocities)
-    return _Compared(measured, None if velocities is None else yaws, sign, consistency.of_scans(rows), notes)
+    return ComparedRadar(
+        measured,
+        None if velocities is None else yaws,
+        sign,
+        consistency.of_scans(rows),
+        checked.moving,
+        notes,
+    )
 
 
 def _estimate_jointly(

@@ -7,31 +7,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
-from radarsdf._core import LocalPlanes
 from radarsdf.arrays import Floats
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.motion import PredictedStep
-from radarsdf.poses.planes import SensorReturns, reduction
-from radarsdf.poses.rigid import covariance_in, increments, moved, rotation, rotation_vector
+from radarsdf.poses.planes import SensorReturns
+from radarsdf.poses.registration import PlaneMap, apart_m, thin
+from radarsdf.poses.rigid import covariance_in, rotation, rotation_vector
 from radarsdf.returns.noise import sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 
 # Local map. With 60 scans, simulated drives were no better, and wrong poses persisted longer. The noise determines a deviation to
 # a percent from 10,000 returns; from 5,000, a sparse recorded drive fell into segments.
 WINDOW = 25  # scans
-_CELLS = 4.0, 2.0  # cell edges, coarse to fine, relative to a map's surfels
 _NOISE_AT = 1, 4, 16, 64  # numbers of scans at which the noise of the sensor is re-estimated
 _NOISE_RETURNS = 10_000  # of the last scans, for this estimate
 
-# Registration by Gauss-Newton. Along the least certain axis, shifted scans of tunnels have 0.6 to 1.2 times the information, those of
-# nine other kinds of scenes 0.02 to 0.19 times.
 _MOST_RETURNS = 2000  # of a scan
-_ITERATIONS, _SETTLED = 8, 0.03  # at each cell size: maximum, tolerance in standard deviations
-_LEAST_VARIANCE = 1e-12  # of a prediction, m² and rad²
-_SHIFTS = 0.0, 1.0, -1.0, 2.0, -2.0  # cells, beyond the extent of single objects
-_SURE = 0.05  # standard deviation of a predicted translation that needs no returns, cells
 
 # Search, where the prediction is less certain than Gauss-Newton requires. Acceptance by a gain over chance alone, or over rivals alone,
 # split three of five recorded drives into more segments.
@@ -70,21 +62,20 @@ class Tracker:
     num_threads: int = 0
     window: int = WINDOW  # scans in the map
     last: Tracked = field(init=False)
-    _planes: list[LocalPlanes] = field(default_factory=list)
+    _planes: PlaneMap = field(init=False)
     # Scans (N, 3), sensor frame, their poses, and the points as added to the planes, for an exact removal.
     _recent: deque[tuple[Floats, Floats, Floats]] = field(default_factory=deque)
-    _variances: list[float] = field(default_factory=list)
     _scans: int = 0
 
     def register(self, scan: Floats, predicted: PredictedStep | None) -> Tracked:
         """Register a scan (N, 3), sensor frame, m, with the map, near the predicted step. None: the first scan."""
-        if predicted is None or not self._planes:
+        if predicted is None or not self._scans:
             return begin_segment(np.eye(4))
         scan = thin(scan, _MOST_RETURNS)
         if len(scan) == 0:
             return self._dead_reckon(predicted)
         radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
-        capture_m = 0.5 * _CELLS[0] * self.cell_size_m
+        capture_m = self._planes.capture_m
         if predicted.spread_m(radius_m) <= capture_m:
             return self._fit_pose(scan, predicted, predicted.turn.mean)
         spread_m = predicted.spread_m(0.0)
@@ -101,21 +92,20 @@ class Tracker:
 
     def add(self, scan: Floats, found: Tracked) -> None:
         """Add a registered scan to the map, without the oldest."""
-        if not self._planes or found.segment != self.last.segment:
-            self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
+        if not self._scans or found.segment != self.last.segment:
+            self._planes = PlaneMap(self.cell_size_m)
             self._recent.clear()
             self._scans = 0
         points = np.ascontiguousarray(np.einsum("ij,nj->ni", found.pose[:3, :3], scan) + found.pose[:3, 3])
         oldest = self._recent.popleft() if len(self._recent) == self.window else None
-        for planes in self._planes:
-            planes.add(points)
-            if oldest is not None:
-                planes.add(oldest[2], -1)
+        self._planes.add(points)
+        if oldest is not None:
+            self._planes.add(oldest[2], -1)
         self._recent.append((scan, found.pose, points))
         self.last = found
         self._scans += 1
         if self._scans in _NOISE_AT:
-            self._variances = self._estimate_variances()
+            self._planes.variances = self._estimate_variances()
 
     def _estimate_variances(self) -> list[float]:
         counts = np.cumsum([len(scan) for scan, *_ in reversed(self._recent)])
@@ -133,67 +123,33 @@ class Tracker:
     def _fit_pose(
         self, scan: Floats, predicted: PredictedStep, turn: Floats, start: Floats | None = None
     ) -> Tracked:
-        """Fit the pose by Gauss-Newton from `start`, coarse to fine, with the prior of a sensor that turned by `turn`."""
+        """Fit the pose, starting from `start`, with the prior of a sensor that turned by `turn`."""
         last_R, mean = self.last.pose[:3, :3], self.last.pose @ predicted.pose(turn)
-        prior = covariance_in(predicted.covariance(turn), last_R) + _LEAST_VARIANCE * np.eye(6)
-        information, pose = np.linalg.inv(prior), mean if start is None else start
-        for planes in self._planes:
-            for _ in range(_ITERATIONS):
-                *equations, inliers = planes.agreement(scan, pose, self._variances)
-                hessian, gradient = _discount_tilts(*equations)
-                total = hessian + information
-                off = gradient + information @ increments(mean, pose)
-                step = -np.linalg.solve(total, off).astype(np.float64)
-                pose = moved(pose, step)
-                if step @ total @ step < 6 * _SETTLED**2:
-                    break
-        covariance = self._discount_chance(scan, pose, prior, np.linalg.inv(total))
-        moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
-        observed = moved_share, _removed_share(prior[3:, 3:], covariance[3:, 3:])
-        turn = rotation_vector(last_R.T @ pose[:3, :3], turn)
-        return Tracked(pose, covariance, inliers / len(scan), self.last.segment, turn, observed)
-
-    def _discount_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
-        """Remove the spurious information along the least certain axis that returns have for any shift of the scan."""
-        # In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance.
-        cell_m = _CELLS[-1] * self.cell_size_m
-        axis = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
-        before, left = axis @ prior[:3, :3] @ axis, axis @ covariance[:3, :3] @ axis
-        if before < (_SURE * cell_m) ** 2:
-            return covariance
-        shifted = np.tile(pose, (len(_SHIFTS), 1, 1))
-        shifted[:, :3, 3] += cell_m * np.outer(_SHIFTS, axis)
-        equations = [self._planes[-1].agreement(scan, at, self._variances)[:3] for at in shifted]
-        hessians, _ = _discount_tilts(*(np.stack(parts) for parts in zip(*equations, strict=True)))
-        variances = np.einsum("i,kij,j->k", axis, np.linalg.pinv(hessians, hermitian=True)[:, :3, :3], axis)
-        information = np.divide(1.0, variances, out=np.zeros_like(variances), where=variances > 0)
-        chance = min(1.0, float(np.mean(information[1:])) / max(float(information[0]), 1e-12))
-        widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
-        covariance = covariance.copy()
-        covariance[:3, :3] += max(widened, 0.0) * np.outer(axis, axis)
-        return covariance
+        found = self._planes.fit(scan, mean, covariance_in(predicted.covariance(turn), last_R), start)
+        turn = rotation_vector(last_R.T @ found.pose[:3, :3], turn)
+        return Tracked(found.pose, found.covariance, found.agreeing, self.last.segment, turn, found.observed)
 
     def _search_pose(
         self, scan: Floats, predicted: PredictedStep, capture_m: float, radius_m: float
     ) -> Tracked | None:
         """Search many poses for the best, if the returns agree there significantly better than elsewhere and than by chance."""
-        coarse, sample = self._planes[0], thin(scan, _SCORED_RETURNS)
+        sample = thin(scan, _SCORED_RETURNS)
 
         def score(poses: Floats) -> Floats:
-            return coarse.scores(sample, np.ascontiguousarray(poses), self._variances)
+            return self._planes.coarse.scores(sample, np.ascontiguousarray(poses), self._planes.variances)
 
         turns, steps = predicted.candidates(capture_m, radius_m)
         poses = np.einsum("ij,kjl->kil", self.last.pose, steps)
         means = score(poses).mean(axis=1)
         rows = _best(means)
         # In a self-similar scene, the best candidates may all lie near a wrong place.
-        elsewhere = np.flatnonzero(_apart_m(poses, poses[rows[0]], radius_m) > 2 * capture_m)
+        elsewhere = np.flatnonzero(apart_m(poses, poses[rows[0]], radius_m) > 2 * capture_m)
         rows = np.concatenate([rows, elsewhere[_best(means[elsewhere])]])
         found = [self._fit_pose(scan, predicted, turns[i], poses[i]) for i in rows]
         at = np.stack([one.pose for one in found])
         scores, by_chance = score(at), score(self._draw_unrelated(radius_m))
         first = int(np.argmax(scores.mean(axis=1)))
-        rivals = scores[_apart_m(at, at[first], radius_m) > capture_m]
+        rivals = scores[apart_m(at, at[first], radius_m) > capture_m]
         gains = scores[first] - np.concatenate([by_chance[_best(by_chance.mean(axis=1))], rivals])
         clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(sample))
         return found[first] if clear.all() else None
@@ -211,29 +167,5 @@ class Tracker:
         return poses
 
 
-def _discount_tilts(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
-    """Return Hessians (..., 6, 6) and gradients (..., 6) without the contribution of errors of the normals."""
-    # Along a wall, slightly tilted normals would seem to observe the position along it.
-    M = reduction(hessian, doubt)
-    return M @ hessian @ M.swapaxes(-1, -2), np.einsum("...ij,...j->...i", M @ M, gradient)
-
-
-def _removed_share(prior: Floats, covariance: Floats) -> float:
-    """Return the share of the prior variance removed, in the direction where it is smallest."""
-    return max(1 - float(eigh(covariance, prior, eigvals_only=True)[-1]), 0.0)
-
-
 def _best(scores: Floats) -> NDArray[np.intp]:
     return np.argsort(-scores, kind="stable")[:_BEST]
-
-
-def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
-    """Return upper bounds (K,) of the displacement, m, of a return at range `radius_m` between poses (K, 4, 4) and `pose`."""
-    off = increments(np.broadcast_to(pose, poses.shape), poses)
-    moved_m, turned_rad = (np.linalg.norm(of, axis=1) for of in (off[:, :3], off[:, 3:]))
-    return moved_m + radius_m * turned_rad
-
-
-def thin(scan: Floats, most: int) -> Floats:
-    """Subsample a scan evenly to about `most` returns."""
-    return np.ascontiguousarray(scan[:: max(1, -(-len(scan) // most))])
