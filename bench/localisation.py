@@ -134,20 +134,17 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def _ours(radar_map: RadarMap, day: Simulation, motion: MeasuredMotion) -> Row:
-    locate, lost_error = (getattr(radarsdf, name, None) for name in ("locate", "Lost"))
-    if locate is None or lost_error is None:
-        return {"method": _OURS, "why_not": "this version has no locate"}
     scans: Row = {"doppler_mps": motion.doppler_mps, "times_s": motion.times_s}
     try:
         with timed() as whole:
-            found = locate(radar_map, day.points, **scans)
+            found = radarsdf.locate(radar_map, day.points, **scans)
     except ValueError as error:
-        why = {"verdict": "refused"} if isinstance(error, lost_error) else {"why_not": str(error)}
+        why = {"verdict": "refused"} if isinstance(error, radarsdf.Lost) else {"why_not": str(error)}
         return {"method": _OURS, "whole_s": whole.cpu_s} | why
     row: Row = {"method": _OURS, "whole_s": whole.cpu_s} | judged(found.poses, day.poses)
     if np.isfinite(found.poses[0]).all():
         with timed() as tracking:
-            locate(radar_map, day.points, guess=found.poses[0], **scans)
+            radarsdf.locate(radar_map, day.points, guess=found.poses[0], **scans)
         row |= {"search_s": whole.cpu_s - tracking.cpu_s, "track_ms": 1e3 * tracking.cpu_s / len(day)}
     return row | {"explained": float(np.nanmedian(found.explained))}
 

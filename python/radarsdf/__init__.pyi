@@ -22,10 +22,16 @@ from .map.radar_map import RadarMap as RadarMap
 from .poses.calibrate import Calibration as Calibration
 from .poses.calibrate import Mounting as Mounting
 from .poses.calibrate import calibrate as calibrate
+from .poses.join import Joined as Joined
+from .poses.join import join as join
+from .poses.locate import Localisation as Localisation
+from .poses.locate import locate as locate
 from .poses.odometry import Odometry as Odometry
 from .poses.odometry import odometry as odometry
 from .poses.refine import RefinedPoses as RefinedPoses
 from .poses.refine import refine_poses as refine_poses
+from .poses.search import Lost as Lost
+from .poses.search import SurfaceIndex as SurfaceIndex
 from .tiles.fit_tiles import fit_tiles as fit_tiles
 from .tiles.tiled_map import TiledMap as TiledMap
 from .tiles.tiled_map import load as load

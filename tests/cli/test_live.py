@@ -51,6 +51,8 @@ class Clock:
         assert seconds >= 0
         self.now_s += seconds
 
+    scan_ids = ()
+
     def integrate(self, _points, pose, _intensities, *, time_s, **_named):
         self.taken.append((round(self.now_s - 100, 9), round(time_s, 9)))
         self.now_s += self.integration_s

@@ -128,3 +128,31 @@ def test_outputs_are_checked_before_the_work(drive, drifted_file, tmp_path, caps
         (["live", path, "--trajectory", out], "needs times"),
     ):
         assert named in refusal(capsys, tmp_path, *words)
+
+
+def test_scans_are_located_in_a_map(drive, motion, tmp_path, capsys):
+    scans = Scans(drive.points, drive.poses, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+    write_scans(tmp_path / "drive.npz", scans)
+    config = radarsdf.FitConfig.quick()
+    radarsdf.fit(drive.points, drive.poses, config=config, progress=False).save(tmp_path / "map.safetensors")
+    out = tmp_path / "found.tum"
+    found = values(capsys, "locate", tmp_path / "map.safetensors", tmp_path / "drive.npz", "-o", out)
+    assert found["found"] == FRAMES
+    assert np.abs(np.loadtxt(out)[:, 1:4] - drive.poses[:, :3, 3]).max() < 0.1
+    near = ["--guess", *drive.poses[0, :3, 3], 0]
+    assert call("locate", tmp_path / "map.safetensors", tmp_path / "drive.npz", "-o", out, *near) == 0
+
+
+def test_sessions_are_joined_in_a_folder(drive, motion, tmp_path, capsys):
+    T = np.eye(4)
+    T[:3, 3] = 50, -20, 1
+    for name, part, world in (("a", slice(0, 16), np.eye(4)), ("b", slice(8, 24), T)):
+        times_s = motion.times_s[part]
+        write_scans(
+            tmp_path / f"{name}.npz", Scans(drive.points[part], world @ drive.poses[part], times_s=times_s)
+        )
+    found = values(capsys, "join", tmp_path / "a.npz", tmp_path / "b.npz", "-o", tmp_path / "joined")
+    assert found["joined"] == ["a.npz", "b.npz"]
+    joined = read_scans(tmp_path / "joined" / "b.npz")
+    assert np.abs(joined.poses - drive.poses[8:24])[:, :3, 3].max() < 0.2
+    assert refusal(capsys, tmp_path, "join", tmp_path / "a.npz", "-o", tmp_path / "other", status=2)

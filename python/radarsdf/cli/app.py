@@ -19,6 +19,7 @@ _MODULES = {
     **dict.fromkeys(("mesh", "eval", "render"), "maps"),
     **dict.fromkeys(("view", "report"), "pages"),
     **dict.fromkeys(("compare", "grid"), "uses"),
+    **dict.fromkeys(("locate", "join"), "localise"),
     "config": "settings",
 }
 

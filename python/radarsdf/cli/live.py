@@ -21,7 +21,7 @@ from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
 from radarsdf.live.live_map import LiveMap
-from radarsdf.live.tracking import Lost
+from radarsdf.poses.search import Lost
 from radarsdf.scans import Scan, Scans
 from radarsdf.view.pages import GrowingView
 from radarsdf.view.serving import url_of, wait
@@ -58,6 +58,7 @@ def replay(
     done = Replay(np.asarray(0.1 * np.arange(count) if scans.times_s is None else scans.times_s))
     due_s = (done.times_s - done.times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
     labels = None if scans.T_body_sensor is None else scans.sensors
+    first = 1 + max((known for known in live.scan_ids if isinstance(known, int)), default=-1)
     begin = time.perf_counter()
     for i in range(count):
         now = time.perf_counter() - begin
@@ -73,7 +74,7 @@ def replay(
                 None if scans.intensities is None else scans.intensities[i],
                 doppler_mps=None if scans.doppler_mps is None else scans.doppler_mps[i],
                 time_s=float(done.times_s[i]),
-                scan_id=i,
+                scan_id=first + i,
                 sensor=None if labels is None else labels[i],
             )
         except Lost:
@@ -84,8 +85,8 @@ def replay(
         done.poses.append(found.pose)
         done.notes = found.notes
         for k, row in enumerate(done.rows):
-            if row in found.moved:
-                done.poses[k] = live.pose(row)
+            if first + row in found.moved:
+                done.poses[k] = live.pose(first + row)
         if on_scan is not None:
             on_scan(done)
     return done
@@ -116,7 +117,12 @@ def live(given: Namespace, results: Results) -> None:
         check(timed, f"{given.scans}: scans without poses need times, one per scan")
         if trajectory is not None:
             check_pose_times(trajectory, scans.times_s)
-        growing = LiveMap(load_config(given), T_body_sensor=scans.T_body_sensor)
+        begin = given.map
+        changed = begin and (given.config or given.set or given.paper)
+        refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
+        growing = (
+            LiveMap.load(begin) if begin else LiveMap(load_config(given), T_body_sensor=scans.T_body_sensor)
+        )
         if urls:
             results.add(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
         shown = _Shown(growing, scans, sinks) if sinks else None

@@ -23,9 +23,11 @@ from radarsdf.fitting.fit import fit
 from radarsdf.fitting.steps import fit_rays
 from radarsdf.live.state import GrowingState
 from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
-from radarsdf.live.tracking import Follower
+from radarsdf.live.tracking import Elsewhere, Follower
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Limits
+from radarsdf.poses.locate import locate
+from radarsdf.poses.search import Lost, SurfaceIndex
 from radarsdf.returns.moving import MovingReturns
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Label, Mounted, checked_mountings
@@ -33,6 +35,8 @@ from radarsdf.scans import Scans
 
 if TYPE_CHECKING:
     import trimesh
+
+_SEARCHED_EVERY = 12  # scans without a pose after which the map is searched
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,7 @@ class LiveMap:
         mountings = None if T_body_sensor is None else checked_mountings(T_body_sensor)
         self._state = GrowingState(config, corner, most, place, mountings)
         self._follower = Follower(config, num_radars=max(len(mountings or ()), 1))
+        self._unplaced: list[tuple[ScanId | None, LoggedScan]] = []  # since tracking was lost
         self._pid = os.getpid()
         self._lock = threading.RLock()  # guards the state
         self._reading = threading.Lock()  # guards its surface; acquired first
@@ -206,7 +211,9 @@ class LiveMap:
         """Add a scan of N returns.
 
         Without a pose, it is registered with the last scans, near the pose predicted by its Doppler or the motion so far. The
-        world is then the frame of the first scan. :func:`radarsdf.refine_poses` corrects drift of the poses for
+        world is then the frame of the first scan. If it agrees nowhere near, as the first scan after :meth:`load`, it is Lost,
+        until every twelfth such scan is found by a search of the whole map, as in :func:`radarsdf.locate`; with it, those before
+        are added. :func:`radarsdf.refine_poses` corrects drift of the poses for
         :meth:`move_all`.
 
         Parameters
@@ -247,6 +254,45 @@ class LiveMap:
         given = None if pose is None else check_pose(pose, "pose").copy()
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         check(given is not None or scan.time_s is not None, "a scan needs a pose, or a time")
+        try:
+            found = self._integrate(scan, given, scan_id, far)
+        except Elsewhere as lost:
+            self._unplaced.append((scan_id, scan))
+            *earlier, (scan, pose, scan_id) = self._find_again(lost)
+            for before, at, before_id in earlier:
+                self._integrate(before, at, before_id, 0)
+            found = self._integrate(scan, pose, scan_id, far)
+        self._unplaced.clear()
+        return found
+
+    def _find_again(self, lost: Lost) -> list[tuple[LoggedScan, Floats, ScanId | None]]:
+        """Search the map for the scans since tracking was lost; return them with poses and ids. Raise `lost` until they are found."""
+        scans = [scan for _, scan in self._unplaced]
+        if len(scans) % _SEARCHED_EVERY or len(self) == 0:
+            raise lost
+        leaf_m, labels = self.config.leaf_size_m, [scan.label for scan in scans]
+        speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
+        drive = Scans(
+            [scan.points for scan in scans],
+            np.full((len(scans), 4, 4), np.nan),
+            doppler_mps=speeds if len(speeds) == len(scans) else None,
+            times_s=np.array([scan.time_s for scan in scans]),
+            sensors=None if self._state.mountings is None else labels,
+            T_body_sensor=self._state.mountings,
+        )
+        try:
+            index = SurfaceIndex.of_mesh(self.mesh(), leaf_m)
+            found = locate(index, drive, config=self.config, progress=False)
+        except ValueError as why:
+            raise lost from why
+        rows = np.flatnonzero((found.segments == found.segments[-1]) & (found.segments >= 0))
+        if len(rows) == 0:
+            raise lost
+        return [(scans[i], found.poses[i], self._unplaced[i][0]) for i in rows]
+
+    def _integrate(
+        self, scan: LoggedScan, given: Floats | None, scan_id: ScanId | None, far: int
+    ) -> Integrated:
         state = self._state
         with self._owned():
             scan_id = state.next_id if scan_id is None else scan_id

@@ -32,6 +32,7 @@ from radarsdf.poses.drive import LEAST_OBSERVED, MOVES, TURNS, Drive, rates_of, 
 from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
+from radarsdf.poses.search import Lost
 from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begin_segment
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.rig import Label, Rig
@@ -53,8 +54,8 @@ _OBSERVED_STEPS = 10  # steps over which returns alone must observe the motion o
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # approximate covariance of a step between given poses
 
 
-class Lost(ValueError):
-    """Tracking was lost: a scan cannot be registered near its predicted pose."""
+class Elsewhere(Lost):
+    """The scan may be anywhere in the map."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ class Follower:
         if not self._steps:
             if len(log):
                 msg = "the map has scans, but none with a time to continue from: give the pose of the scan, and its time"
-                raise Lost(msg)
+                raise Elsewhere(msg)
             return [new]
         last = self._steps[-1]
         at_once = new.logged.label != last.logged.label and new.time_s == last.time_s
@@ -152,20 +153,21 @@ class Follower:
         found = self._start(log, new, sign) or [self._next(new, sign)]
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
-        why = ""
+        why, kind = "", Lost
         sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
         sign_open = sign_open and len(self._of_radar(new)) > 1  # other radars see other places
         if any(step.found.segment for step in found) or (
             sign_open and found[-1].found.agreeing < _LEAST_AGREEING
         ):
             why = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
+            kind = Elsewhere
         elif not by_doppler and len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED:
             why = "the returns alone do not observe the motion of the sensor"
         if why:
             msg = f"{why}: give its pose, or its Doppler (doppler_mps)"
             if logged.doppler_mps is not None and not by_doppler:
                 msg += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
-            raise Lost(msg)
+            raise kind(msg)
         if (leap_mps := self._leap_mps(new)) is not None:
             msg = f"{NOT_USED}: its velocity changes by {leap_mps:.1f} m/s, far more than before: give the pose of the scan"
             raise Lost(msg)

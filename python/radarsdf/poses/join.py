@@ -1,0 +1,156 @@
+"""Joining of several sessions at one place in one frame (multi-session mapping)."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from radarsdf.arrays import Floats, Ints
+from radarsdf.checks import check, instance
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.estimate import PosesEstimate
+from radarsdf.poses.motion import Motion, unsteadiness
+from radarsdf.poses.odometry import odometry
+from radarsdf.poses.planes import SensorReturns, plane_cell_m
+from radarsdf.poses.rigid import aligned
+from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
+from radarsdf.scans import Scans
+from radarsdf.threads import ThreadPool
+
+JOINED, APART, AMBIGUOUS = "joined", "apart", "ambiguous"
+_FIRST_SIGMAS = 0.1, 0.01  # minimum standard deviations of a step, m and rad
+# Agreement with surfaces of another session, at the best place, from which several places are alike; below, none is the same.
+_ALIKE = 0.5
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Sessions in one frame."""
+
+    poses: list[Floats]
+    """(F_i, 4, 4) each, T_world_sensor, m, in the world of the first session. NaN for scans that were not joined."""
+    verdicts: dict[tuple[int, int], str]
+    """Of each pair of sessions, by their numbers: `joined`, found in each other directly; `apart`, of different places, or
+    hardly overlapping; or `ambiguous`, where several places fit alike."""
+    report: dict[str, Any]
+    """`verdict` in words, `joined`, numbers of the sessions in the frame of the first one, and `seconds`."""
+
+
+def join(sessions: Sequence[Scans], *, config: FitConfig | None = None) -> Joined:
+    """Find the poses of several sessions at one place in one frame, to fit or compare them.
+
+    Sessions without poses are first placed by :func:`odometry`. Submaps of each session are searched in the surfaces of each
+    other one, as in :func:`locate`, and the scans of all sessions that belong together are refined jointly.
+
+    Parameters
+    ----------
+    sessions : sequence of Scans
+        Each with poses, or with what :func:`odometry` needs. Only the longest segment of its drive is joined.
+    config : FitConfig, optional
+        Settings, of which ranges, leaf cells and threads are used.
+
+    Returns
+    -------
+    Joined
+        Poses in the world of the first session.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As :func:`odometry`, and for fewer than two sessions.
+    """
+    begin = time.perf_counter()
+    config = FitConfig() if config is None else instance(config, FitConfig, "config")
+    check(len(sessions) > 1, f"sessions must be at least two, not {len(sessions)}")
+    placed = [_Session.of(session, config) for session in sessions]
+    verdicts: dict[tuple[int, int], str] = {}
+    transforms: dict[int, Floats] = {0: np.eye(4)}
+    with ThreadPool(config.num_threads) as pool:
+        indices = [
+            SurfaceIndex.of_returns(one.returns, one.poses, config.leaf_size_m, pool.num_threads)
+            for one in placed
+        ]
+        found: dict[tuple[int, int], Floats] = {}
+        for i, k in itertools.combinations(range(len(placed)), 2):
+            try:
+                T, _ = search_scans(indices[i], placed[k].returns, placed[k].poses, pool.num_threads)
+                found[i, k], found[k, i] = T, np.linalg.inv(T).astype(np.float64)
+                verdicts[i, k] = JOINED
+            except Lost as lost:
+                verdicts[i, k] = AMBIGUOUS if lost.agreeing > _ALIKE else APART
+        while new := [(i, k) for i, k in found if i in transforms and k not in transforms]:
+            i, k = new[0]
+            transforms[k] = transforms[i] @ found[i, k]
+        together = sorted(transforms)
+        poses = [np.full((len(session), 4, 4), np.nan) for session in sessions]
+        for k, refined in zip(together, _refine(placed, transforms, config, pool.num_threads), strict=True):
+            poses[k][placed[k].rows] = refined
+    words = f"{len(together)} of {len(sessions)} sessions are in one frame."
+    others = [
+        f"sessions {i} and {k} are {verdict}" for (i, k), verdict in verdicts.items() if verdict != JOINED
+    ]
+    report = {
+        "verdict": " ".join([words, *[f"{other.capitalize()}." for other in others]]),
+        "joined": together,
+        "seconds": time.perf_counter() - begin,
+    }
+    return Joined(poses, verdicts, report)
+
+
+@dataclass(frozen=True)
+class _Session:
+    rows: Ints  # (K,) scans with poses
+    scans: list[Floats]  # (N_i, 3) static returns of these, frame of the poses, m
+    returns: SensorReturns
+    poses: Floats  # (K, 4, 4) in the world of the session
+
+    @classmethod
+    def of(cls, session: Scans, config: FitConfig) -> _Session:
+        instance(session, Scans, "a session")
+        rig, radars = CheckedScans.of_radars(session, None, None)
+        scans: list[Floats] = [np.zeros((0, 3))] * len(session)
+        for rows, checked in radars:
+            for row, scan in zip(rows, checked.scans, strict=True):
+                scans[row] = scan
+        scans = scans if rig is None else rig.in_body(scans)
+        poses, rows = session.poses, np.arange(len(session))
+        if not np.isfinite(poses).all():
+            motion = odometry(session, config=config, progress=False)
+            poses, rows = motion.poses, rows[motion.longest_segment()]
+        limits, own = config.returns, [scans[i] for i in rows]
+        own_rig = None if rig is None else rig.select(rows)
+        returns = SensorReturns.of(own, limits.min_range_m, limits.max_range_m, own_rig)
+        return cls(rows, own, returns, poses[rows])
+
+
+def _refine(
+    placed: Sequence[_Session], transforms: dict[int, Floats], config: FitConfig, num_threads: int
+) -> list[Floats]:
+    """Refine the poses of the sessions jointly, from common planes and the steps within each, in the world of the first."""
+    together = sorted(transforms)
+    poses = [np.einsum("ij,fjk->fik", transforms[k], placed[k].poses) for k in together]
+    sessions, before = [placed[k] for k in together], np.concatenate(poses)
+    if len(sessions) == 1:
+        return poses
+    ends = np.cumsum([len(one) for one in poses])
+    numbers = [
+        one.returns.scans + np.int32(end - len(one.poses)) for one, end in zip(sessions, ends, strict=True)
+    ]
+    parts = [(one.returns.directions, one.returns.ranges_m) for one in sessions]
+    directions, ranges_m = (np.concatenate(part) for part in zip(*parts, strict=True))
+    returns = SensorReturns(directions, ranges_m, np.concatenate(numbers))
+    sigmas = np.max([_FIRST_SIGMAS, *[unsteadiness(one, None) for one in poses]], axis=0).tolist()
+    motion = Motion.of(before, *sigmas)
+    motion.shares[ends[:-1] - 1] = np.inf  # from one session to the next
+    cell_m = plane_cell_m([scan for one in sessions for scan in one.scans], config.leaf_size_m)
+    found = PosesEstimate.of(returns, before, [motion], cell_m, config.returns, num_threads, len(before))
+    # The first session keeps its frame.
+    first = found.poses[: ends[0]]
+    whole = aligned(first, poses[0])[0] @ np.linalg.inv(first[0])
+    return np.split(np.einsum("ij,fjk->fik", whole, found.poses), ends[:-1])

@@ -1,0 +1,320 @@
+"""Localisation of scans in a map made before."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from radarsdf.arrays import Floats, Ints
+from radarsdf.checks import check_pose, instance
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.imu import Imu
+from radarsdf.map.map import Map
+from radarsdf.poses.drive import Drive
+from radarsdf.poses.estimate import PosesEstimate
+from radarsdf.poses.odometry import track_scans
+from radarsdf.poses.planes import SensorReturns, plane_cell_m
+from radarsdf.poses.registration import PlaneMap, thin
+from radarsdf.poses.rigid import covariance_in, increments
+from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
+from radarsdf.poses.tracking import Tracked
+from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
+from radarsdf.scans import Scans
+from radarsdf.threads import ThreadPool
+
+_WEAK = 1e-4  # information of a weak prior of a pose, 1/m² and 1/rad²
+_MOST_RETURNS = 2000  # of a scan
+_FINE_CELLS = (
+    0.5  # cells of planes for the last estimate: larger ones bend poles and corners, 4 to 17 cm, not 1 to 6
+)
+_PART = 12  # scans whose drift is corrected together
+_FEWEST = 6  # scans to search
+# Least agreement of a part of the drive that is where it seems, relative to that found first. Of a part after a jump of 20 m, fitted to
+# other surfaces: 0.64; of others 0.8 to 1.
+_LEAST_AGREEING = 0.75
+_PLACE_RAD = 0.1  # standard deviation of the rotation of a place that was found
+_GUESS_SIGMAS = np.repeat([0.5, 0.05], 3)  # standard deviations of a guess, m and rad
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Poses of scans in the world of a map."""
+
+    poses: Floats
+    """(F, 4, 4) T_map_sensor, m; of a rig, T_map_body. NaN where the scan is lost."""
+    covariance: Floats
+    """(F, 6, 6) as in :class:`RefinedPoses`, but in the world of the map. NaN where the scan is lost."""
+    explained: Floats
+    """(F,) share of the returns of each scan on surfaces of the map, in [0, 1]. NaN where it is lost."""
+    segments: Ints
+    """(F,) segment of the drive of each scan, each found by itself; -1 where it is lost."""
+    report: dict[str, Any]
+    """`verdict` in words; `found`, number of scans; `lost`, a sentence for each segment that was not found; `notes`; `seconds`."""
+
+
+def locate(
+    radar_map: Map | SurfaceIndex,
+    points: Iterable[ArrayLike] | Scans,
+    *,
+    doppler_mps: Sequence[ArrayLike] | None = None,
+    times_s: ArrayLike | None = None,
+    imu: Imu | None = None,
+    guess: ArrayLike | None = None,
+    config: FitConfig | None = None,
+    progress: bool | None = None,
+) -> Localisation:
+    """Localise scans in a map made before (global localisation, relocalisation).
+
+    Tracks the scans as :func:`odometry` does, searches the whole map for a submap of the first of them, and estimates all poses
+    jointly from the surfaces of the map, those that scans share, and the measured motion. Where tracking is lost, as of a
+    kidnapped robot, the scans from there on are searched anew.
+
+    Parameters
+    ----------
+    radar_map : Map or SurfaceIndex
+        Of this or another radar. Its z axis must be about vertical. The index of a large map, ``radarsdf.SurfaceIndex.of(map)``,
+        serves any number of calls, and can be saved.
+    points : iterable of F arrays, or Scans
+        (N_i, 3) each, with `doppler_mps`, `times_s` and `imu` as in :func:`odometry`.
+    guess : (4, 4) array_like, optional
+        T_map_sensor of the first scan, to about 0.5 m and 3 degrees, instead of a search for it.
+    config : FitConfig, optional
+        Settings, of which ranges, leaf cells and threads are used.
+    progress : bool, optional
+        Whether to show a progress bar. Default: only on a terminal.
+
+    Returns
+    -------
+    Localisation
+        Poses in the world of the map.
+
+    Raises
+    ------
+    Lost
+        If no scan is found: the scans agree with the map nowhere, or in several places, which its `places` are. A ValueError.
+    TypeError, ValueError
+        As :func:`odometry`, and if the map has no surface.
+
+    Notes
+    -----
+    A place is accepted if a submap of several scans agrees with the map better there than anywhere else, by a test of paired
+    differences and at odds of 1000 to 1. Along a tunnel or between equal buildings, no such place exists.
+
+    Examples
+    --------
+    >>> import radarsdf
+    >>> scans = radarsdf.simulate.hugin(frames=24)
+    >>> radar_map = radarsdf.fit(scans.points, scans.poses, config=radarsdf.FitConfig.quick())
+    >>> motion = radarsdf.simulate.measured_motion(scans)
+    >>> found = radarsdf.locate(radar_map, scans.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+    >>> bool(abs(found.poses - scans.poses).max() < 0.1)
+    True
+    """
+    begin = time.perf_counter()
+    index = radar_map
+    if not isinstance(index, SurfaceIndex):
+        index = SurfaceIndex.of(instance(index, Map, "radar_map"))  # type: ignore[type-abstract]
+    config = FitConfig() if config is None else instance(config, FitConfig, "config")
+    start = None if guess is None else check_pose(guess, "guess")
+    with ThreadPool(config.num_threads) as pool:
+        drive, tracked, *_, notes = track_scans(
+            points, doppler_mps, times_s, imu, config, pool.num_threads, progress
+        )
+        count = len(tracked)
+        poses, covariance = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
+        explained, segments = np.full(count, np.nan), np.full(count, -1)
+        why: list[Lost] = []
+        localiser = _Localiser(index, drive, tracked, config, pool.num_threads)
+        of_scans = np.array([found.segment for found in tracked])
+        parts = [np.flatnonzero(of_scans == segment) for segment in range(of_scans[-1] + 1)]
+        while parts:
+            part = parts.pop(0)
+            try:
+                rows, *found = localiser.locate(part, start if part[0] == 0 else None)
+            except Lost as refused:
+                why.append(refused)
+                continue
+            poses[rows], covariance[rows], explained[rows] = found
+            poses[rows, :3, 3] += index.origin
+            segments[rows] = segments.max() + 1
+            # The others do not agree there: the radar may have been moved, or left the map.
+            others = part[part < rows[0]], part[part > rows[-1]]
+            parts = [*(rest for rest in others if len(rest) >= _FEWEST), *parts]
+    if segments.max() < 0:
+        raise why[0]
+    report = {
+        "verdict": _summarize(segments, explained),
+        "found": int((segments >= 0).sum()),
+        "lost": [str(each) for each in why],
+        "notes": notes,
+        "seconds": time.perf_counter() - begin,
+    }
+    return Localisation(poses, covariance, explained, segments, report)
+
+
+def _summarize(segments: Ints, explained: Floats) -> str:
+    found = segments >= 0
+    words = f"{found.sum()} of {len(found)} scans were found, the map explains {np.nanmedian(explained):.0%} of a scan's returns."
+    if found.all():
+        return words
+    gone = np.flatnonzero(~found)
+    runs = np.split(gone, np.flatnonzero(np.diff(gone) > 1) + 1)
+    return f"{words} Lost: scans {', '.join(f'{run[0]} to {run[-1]}' for run in runs)}."
+
+
+@dataclass(frozen=True)
+class _Localiser:
+    """Finds the segments of a tracked drive in a map."""
+
+    index: SurfaceIndex
+    drive: Drive
+    tracked: list[Tracked]
+    config: FitConfig
+    num_threads: int
+
+    def locate(self, rows: Ints, guess: Floats | None) -> tuple[Ints, Floats, Floats, Floats]:
+        """Return those of the scans `rows` (K,) of a segment that are found together, with poses, covariances and explained shares."""
+        poses = np.stack([self.tracked[i].pose for i in rows])
+        rig = None if self.drive.rig is None else self.drive.rig.select(rows)
+        limits, scans = self.config.returns, [self.drive.scans[i] for i in rows]
+        returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
+        if len(returns) == 0:
+            msg = "the scans have no returns"
+            raise Lost(msg)
+        submap = slice(0, 1)
+        if guess is None:
+            T_map_own, submap = search_scans(self.index, returns, poses, self.num_threads)
+        else:
+            T_map_own = guess @ np.linalg.inv(poses[0])
+        T_map_own = T_map_own.copy()
+        T_map_own[:3, 3] -= self.index.origin
+        poses = np.einsum("ij,fjk->fik", T_map_own, poses)
+        first = poses[0]
+        thinned = [thin(scan, _MOST_RETURNS) for scan in scans]
+        reach_m = float(np.percentile(returns.ranges_m, 99))
+        planes = self.index.near(poses[:, :3, 3], 1.5 * reach_m)
+        rays = returns.posed(poses)
+        surfels = Surfels.of(rays, self.index.cell_m / LEAVES_PER_SURFEL, self.num_threads)
+        noise = sensor_noise(surfels, rays, limits, self.num_threads)
+        planes.variances = noise.variances
+        poses, kept = self._follow(planes, thinned, poses, rows, submap)
+        rows, poses, thinned = rows[kept], poses[kept], thinned[kept]
+        scans, rig = scans[kept], None if rig is None else rig.select(kept)
+        # The place is known to the capture range of the planes: nothing is alike farther away.
+        row, sigmas = (submap.start + submap.stop) // 2 - kept.start, [planes.capture_m, _PLACE_RAD]
+        near = (0, first, _GUESS_SIGMAS) if guess is not None else (row, poses[row], np.repeat(sigmas, 3))
+        anchor = _Anchor.of(self.index, noise, thinned, poses, 1.5 * reach_m, near)
+        if len(rows) < 2:
+            information = anchor(poses)[0] + _WEAK * np.eye(6)
+            return rows, poses, np.linalg.inv(information).astype(np.float64), anchor.explained(poses)
+        placed = [
+            dataclasses.replace(self.tracked[i], pose=pose) for i, pose in zip(rows, poses, strict=True)
+        ]
+        whole = [*self.tracked[: rows[0]], *placed, *self.tracked[rows[-1] + 1 :]]
+        motions = self.drive.motions(whole, slice(rows[0], rows[-1] + 1))
+        returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
+        cell_m = plane_cell_m(scans, self.config.leaf_size_m)
+        found = PosesEstimate.of(
+            returns, poses, motions, cell_m, limits, self.num_threads, len(rows), False, anchor
+        )
+        return rows, found.poses, found.covariance, anchor.explained(found.poses)
+
+    def _follow(
+        self, planes: PlaneMap, scans: list[Floats], poses: Floats, rows: Ints, submap: slice
+    ) -> tuple[Floats, slice]:
+        """Correct the drift of poses (K, 4, 4) by registering parts of the drive with the planes, from the submap outwards.
+
+        Also returns the scans that agree with the planes as those of the submap do.
+        """
+        # Parts of several scans: single sparse ones follow wrong planes, and the next ones follow them.
+        found, parts = poses.copy(), np.array_split(np.arange(len(poses)), max(len(poses) // _PART, 1))
+        middle = next(i for i, part in enumerate(parts) if part[-1] >= (submap.start + submap.stop) // 2)
+        radius_m = float(np.median(np.linalg.norm(np.concatenate(scans), axis=1)))
+        wide = np.diag(np.repeat([planes.capture_m / 2, planes.capture_m / 2 / radius_m], 3) ** 2)
+        ends, needed = [0, 0], 0.0
+        for k, order in enumerate((parts[middle:], parts[: middle + 1][::-1])):
+            correction, prior = np.eye(4), wide
+            for part in order:
+                own = poses[part[len(part) // 2]]
+                back = np.linalg.inv(own)
+                near = [scans[i] @ (back @ poses[i])[:3, :3].T + (back @ poses[i])[:3, 3] for i in part]
+                points, mean = thin(np.concatenate(near), _MOST_RETURNS), correction @ own
+                registered = planes.fit(points, mean, prior)
+                # Along the least certain axis, a step by chance is discounted as its information is.
+                axis, pose = registered.least_certain, registered.pose.copy()
+                pose[:3, 3] -= (1 - registered.observed[0]) * (axis @ (pose - mean)[:3, 3]) * axis
+                both = np.stack([mean, pose])
+                agreeing = planes.fine.scores(points, both, planes.variances).mean(axis=1).tolist()
+                pose = pose if agreeing[1] >= agreeing[0] else mean
+                needed = needed or _LEAST_AGREEING * max(agreeing)
+                if max(agreeing) < needed:
+                    break
+                correction, ends[k] = pose @ back, int(part[0 if k else -1])
+                found[part] = np.einsum("ij,fjk->fik", correction, poses[part])
+                drift = np.sum([self.tracked[rows[i]].covariance for i in part], axis=0)
+                prior = registered.covariance + covariance_in(drift, pose[:3, :3])
+        return found, slice(ends[1], ends[0] + 1)
+
+
+@dataclass(frozen=True)
+class _Anchor:
+    """Planes of a map, with which all scans agree, and the place that was found or guessed."""
+
+    planes: PlaneMap
+    scans: list[Floats]  # (N_i, 3) returns on visible sides of surfaces, sensor frame, m
+    numbers: Ints  # (F,) of all returns of these scans
+    # (6, 6) square root of the share of information that is kept: returns share the errors of the map, and agree by chance.
+    kept: Floats
+    near: tuple[int, Floats, Floats]  # a scan, its pose (4, 4) as found, and standard deviations (6,) of that
+
+    @classmethod
+    def of(
+        cls,
+        index: SurfaceIndex,
+        noise: SensorNoise,
+        scans: list[Floats],
+        poses: Floats,
+        reach_m: float,
+        near: tuple[int, Floats, Floats],
+    ) -> _Anchor:
+        planes = index.near(poses[:, :3, 3], reach_m, _FINE_CELLS)
+        planes.variances = noise.variances
+        facing, cells = [], []
+        for scan, pose in zip(scans, poses, strict=True):
+            rays = np.einsum("ij,nj->ni", pose[:3, :3], scan)
+            # Thin walls and trunks have two sides, of which the map may show the other one.
+            seen = np.einsum("ni,ni->n", rays, index.normals_at(rays + pose[:3, 3])) < 0
+            facing.append(np.ascontiguousarray(scan[seen]))
+            cells.append(np.floor((rays[seen] + pose[:3, 3]) / (3 * index.cell_m)))
+        number = sum(map(len, facing))
+        alike = number / max(len(np.unique(np.concatenate(cells), axis=0)), 1)
+        ranges_m = np.linalg.norm(np.concatenate(facing), axis=1).astype(np.float32)
+        variance_m2 = float(noise.mean_variances_m2(ranges_m).mean()) if number else 1.0
+        weight = 1 / (1 + alike * index.surface.thickness_m**2 / variance_m2)
+        axis, chance = planes.information_by_chance(facing, poses)
+        kept = np.eye(6)
+        kept[:3, :3] -= (1 - np.sqrt(1 - chance)) * np.outer(axis, axis)
+        numbers = np.array([len(scan) for scan in scans])
+        return cls(planes, facing, numbers, np.sqrt(weight) * kept, near)
+
+    def __call__(self, poses: Floats) -> tuple[Floats, Floats]:
+        parts = [self.planes.normal_equations(s, p) for s, p in zip(self.scans, poses, strict=True)]
+        hessians, gradients = (np.stack(each) for each in list(zip(*parts, strict=True))[:2])
+        hessians = self.kept @ hessians @ self.kept
+        gradients = gradients @ (self.kept @ self.kept)
+        row, pose, sigmas = self.near
+        hessians[row] += np.diag(sigmas**-2.0)
+        gradients[row] += sigmas**-2.0 * increments(pose, poses[row])
+        return hessians, gradients
+
+    def explained(self, poses: Floats) -> Floats:
+        """Return the share (F,) of returns that agree with the planes."""
+        agreeing = [self.planes.normal_equations(s, p)[2] for s, p in zip(self.scans, poses, strict=True)]
+        return np.array(agreeing) / np.maximum(self.numbers, 1)

@@ -1,0 +1,202 @@
+"""Scans found again in a map, sessions joined, and loops closed."""
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.io import Scans
+from radarsdf.poses.rigid import increments, moved
+from radarsdf.simulate import hugin, measured_motion
+
+from scenes.kinds import KINDS
+from scenes.revisits import SYMMETRIC, another_day, sessions, weaker
+
+from ..conftest import recorded_file
+
+
+def fitted(first):
+    return radarsdf.fit(first.points, first.poses, config=FitConfig.quick(), progress=False)
+
+
+def measured(day, frames=slice(None)):
+    """Arguments of odometry for some of the scans."""
+    motion = measured_motion(day)
+    return {
+        "points": day.points[frames],
+        "doppler_mps": motion.doppler_mps[frames],
+        "times_s": motion.times_s[frames],
+    }
+
+
+def located(radar_map, day, **more):
+    scans = measured(day)
+    return radarsdf.locate(radar_map, scans.pop("points"), **scans, **more)
+
+
+def errors(found, true):
+    """Position errors, m, and angles, degrees."""
+    off = increments(true, found)
+    return np.linalg.norm(off[:, :3], axis=1), np.degrees(np.linalg.norm(off[:, 3:], axis=1))
+
+
+@pytest.fixture(scope="module")
+def first():
+    return hugin(seed=1, frames=60)
+
+
+@pytest.fixture(scope="module")
+def radar_map(first):
+    return fitted(first)
+
+
+@pytest.fixture(scope="module")
+def day(first):
+    return another_day(first, 1)
+
+
+def test_scans_of_another_day_are_found_in_the_whole_map(radar_map, day):
+    found = located(radar_map, day)
+    off_m, off_deg = errors(found.poses, day.poses)
+    assert np.median(off_m) < 0.05
+    assert np.median(off_deg) < 0.3
+    assert (found.segments == 0).all()
+    assert found.explained.min() > 0.3
+    sigmas = np.sqrt(found.covariance[:, :3, :3].trace(axis1=1, axis2=2))
+    assert np.median(off_m / sigmas) < 3
+
+
+@pytest.mark.parametrize("how", ["weaker", "reverse"])
+def test_another_radar_and_the_other_direction(first, radar_map, how):
+    changed = {"sensor": weaker(first.sensor)} if how == "weaker" else {"reverse": True}
+    other = another_day(first, 1, **changed)
+    off_m, off_deg = errors(located(radar_map, other).poses, other.poses)
+    assert np.median(off_m) < 0.1
+    assert np.median(off_deg) < 0.6
+
+
+def test_a_saved_map_and_a_turned_world(first, day, tmp_path):
+    # The pose of the frame of the odometry has nothing to do with that of the map.
+    T = moved(np.eye(4), np.array([5e5, 5.4e6, 300.0, 0, 0, 2.0]))
+    turned = radarsdf.fit(first.points, T @ first.poses, config=FitConfig.quick(), progress=False)
+    turned.save(tmp_path / "map.safetensors")
+    found = located(radarsdf.load(tmp_path / "map.safetensors"), day)
+    assert np.median(errors(found.poses, T @ day.poses)[0]) < 0.05
+
+
+@pytest.mark.parametrize("name", list(SYMMETRIC))
+def test_symmetric_places_are_refused(name):
+    place = SYMMETRIC[name](seed=2)
+    with pytest.raises(radarsdf.Lost, match="two places") as refused:
+        located(fitted(place), another_day(place, 2))
+    assert refused.value.places.shape == (2, 4, 4)
+
+
+def test_scans_of_another_place_are_refused(radar_map):
+    other = KINDS["yard"](seed=3, frames=24)
+    with pytest.raises(radarsdf.Lost):
+        located(radar_map, other)
+
+
+def test_a_guess_replaces_the_search():
+    tunnel = KINDS["tunnel"](seed=2, frames=40)
+    day = another_day(tunnel, 2)
+    radar_map = fitted(tunnel)
+    with pytest.raises(radarsdf.Lost):
+        located(radar_map, day)
+    guess = moved(day.poses[0], np.array([0.2, -0.2, 0.1, 0.01, 0, 0.03]))
+    found = located(radar_map, day, guess=guess)
+    off = np.abs(increments(day.poses, found.poses)[:, :3])
+    sigmas = np.sqrt(np.einsum("fii->fi", found.covariance)[:, :3])
+    assert np.median(off / sigmas) < 3
+    assert np.median(errors(found.poses, day.poses)[0]) < 0.5
+
+
+def test_a_kidnapped_radar_is_found_again(first, radar_map):
+    early, late = (another_day(first, 1, stretch=part) for part in ((0.0, 0.3), (0.7, 1.0)))
+    parts = [measured(one) for one in (early, late)]
+    points, speeds = ([*parts[0][name], *parts[1][name]] for name in ("points", "doppler_mps"))
+    times_s = np.concatenate([parts[0]["times_s"], parts[0]["times_s"][-1] + 0.1 + parts[1]["times_s"]])
+    found = radarsdf.locate(radar_map, points, doppler_mps=speeds, times_s=times_s)
+    true = np.concatenate([early.poses, late.poses])
+    known = found.segments >= 0
+    assert errors(found.poses[known], true[known])[0].max() < 0.5
+    assert known[: len(early)].mean() > 0.8
+    assert known[len(early) :].mean() > 0.8
+    assert set(found.segments[len(early) :]) - set(found.segments[: len(early)])
+
+
+def test_sessions_are_joined_or_apart():
+    of_place = sessions("hugin", 4)
+
+    def scans(day, posed):
+        motion = measured_motion(day)
+        poses = day.poses if posed else np.full((len(day), 4, 4), np.nan)
+        return Scans(day.points, poses, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+
+    together = [scans(day, posed=i == 0) for i, day in enumerate(of_place.together)]
+    found = radarsdf.join(together)
+    assert found.report["joined"] == [0, 1, 2]
+    for poses, day in zip(found.poses, of_place.together, strict=True):
+        assert np.median(errors(poses, day.poses)[0]) < 0.15
+    found = radarsdf.join([scans(day, posed=False) for day in of_place.apart])
+    assert found.verdicts[0, 1] != "joined"
+    assert np.isnan(found.poses[1]).all()
+
+
+def test_the_second_arc_of_a_recorded_roundabout():
+    arrays = np.load(recorded_file("astyx/r0144_0167.npz"))
+    scans = [
+        arrays["points"][(arrays["frame"] == i) & arrays["static"]].astype(np.float64)
+        for i in range(len(arrays["poses"]))
+    ]
+    speeds = [
+        arrays["doppler"][(arrays["frame"] == i) & arrays["static"]] for i in range(len(arrays["poses"]))
+    ]
+    radar_map = radarsdf.fit(scans[:11], arrays["poses"][:11], config=FitConfig.quick(), progress=False)
+    guess = moved(arrays["poses"][11], np.array([0.2, 0.2, 0.1, 0, 0, 0.02]))
+    later = {"doppler_mps": speeds[11:], "times_s": arrays["times"][11:]}
+    found = radarsdf.locate(radar_map, scans[11:], **later, guess=guess)
+    off_m, off_deg = errors(found.poses, arrays["poses"][11:])
+
+    assert np.median(off_m) < 0.3
+    assert np.median(off_deg) < 2
+
+
+def test_a_live_map_of_another_session_finds_the_radar(first, day, tmp_path):
+    live = radarsdf.LiveMap()
+    scans = measured(first)
+    for points, pose, speeds, time_s in zip(
+        scans["points"], first.poses, scans["doppler_mps"], scans["times_s"], strict=True
+    ):
+        live.integrate(points, pose, doppler_mps=speeds, time_s=time_s)
+    live.save(tmp_path / "live.npz")
+    live = radarsdf.LiveMap.load(tmp_path / "live.npz")
+    later = measured(day)
+    lost, off_m = 0, []
+    for i, points in enumerate(later["points"]):
+        given = {"doppler_mps": later["doppler_mps"][i], "time_s": 86_400 + later["times_s"][i]}
+        try:
+            found = live.integrate(points, **given)
+        except radarsdf.Lost:
+            lost += 1
+            continue
+        off_m.append(errors(found.pose[None], day.poses[i : i + 1])[0][0])
+    assert lost < 15
+    assert np.max(off_m) < 0.15
+    # With the first one that was found, those before it came into the map.
+    assert len(live) == len(first) + len(day)
+
+
+def test_the_index_of_a_map_is_saved(radar_map, day, tmp_path):
+    index = radarsdf.SurfaceIndex.of(radar_map)
+    index.save(tmp_path / "index.npz")
+    again = radarsdf.SurfaceIndex.load(tmp_path / "index.npz")
+    scans = measured(day, slice(0, 12))
+    points = scans.pop("points")
+    found = [radarsdf.locate(each, points, **scans).poses for each in (index, again)]
+    assert np.abs(found[0] - found[1]).max() < 1e-3
+    content = bytearray((tmp_path / "index.npz").read_bytes())
+    content[2000] ^= 255
+    (tmp_path / "index.npz").write_bytes(content)
+    with pytest.raises(ValueError, match=r"index\.npz"):
+        radarsdf.SurfaceIndex.load(tmp_path / "index.npz")
