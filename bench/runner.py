@@ -227,9 +227,9 @@ def _table(experiment: Experiment, rows: Sequence[Row]) -> str:
         names_of_lines.append(["mean", *[""] * (len(keys) - 1)])
     texts = [[_cell(cell, column.digits, experiment.median) for cell in cells] for column, cells in values]
     _set_bold(texts, values, by_line=bool(experiment.across))
+    cells_of_lines = list(zip(*texts, strict=True)) or [()] * len(names_of_lines)
     return markdown(
-        header,
-        [names + list(own) for names, own in zip(names_of_lines, zip(*texts, strict=True), strict=True)],
+        header, [[*names, *own] for names, own in zip(names_of_lines, cells_of_lines, strict=True)]
     )
 
 

@@ -22,6 +22,7 @@ from radarsdf.poses.rigid import transform
 def locate(given: Namespace, results: Results) -> None:
     """Localise the scans in the map, print what was found, and write the poses of the scans that were."""
     out = given.out
+    refuse_if(given.poses, f"locate does not use poses: leave out {given.poses}")
     as_scans = out.suffix.lower() == ".npz"
     if not as_scans:
         checked_suffix(out, POSE_SUFFIXES, "poses to write")
