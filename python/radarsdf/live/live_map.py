@@ -27,7 +27,7 @@ from radarsdf.live.tracking import Elsewhere, Follower
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Limits
 from radarsdf.poses.locate import locate
-from radarsdf.poses.search import Lost, SurfaceIndex
+from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex
 from radarsdf.returns.moving import MovingReturns
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Label, Mounted, checked_mountings
@@ -35,8 +35,6 @@ from radarsdf.scans import Scans
 
 if TYPE_CHECKING:
     import trimesh
-
-_SEARCHED_EVERY = 12  # scans without a pose after which the map is searched
 
 
 @dataclass(frozen=True)
@@ -268,7 +266,7 @@ class LiveMap:
     def _find_again(self, lost: Lost) -> list[tuple[LoggedScan, Floats, ScanId | None]]:
         """Search the map for the scans since tracking was lost; return them with poses and ids. Raise `lost` until they are found."""
         scans = [scan for _, scan in self._unplaced]
-        if len(scans) % _SEARCHED_EVERY or len(self) == 0:
+        if len(scans) % SUBMAP_SCANS or len(self) == 0:
             raise lost
         leaf_m, labels = self.config.leaf_size_m, [scan.label for scan in scans]
         speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]

@@ -31,7 +31,7 @@ _SETTLED = 0.3
 _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
 _EXACT = 1e-3  # tolerance for differences of solutions
 # Information of a weak prior on each pose, 1/m² and 1/rad²: unobserved components are not changed.
-_WEAK = 1e-4
+WEAK = 1e-4
 _FIXED = 1e10  # information that fixes the reference pose of the covariance
 
 # Measurement of absolute poses (F, 4, 4): its Hessian (F, 6, 6) and gradient (F, 6) by increments.
@@ -118,7 +118,7 @@ def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> t
     if anchor is not None:
         of_poses, of_gradient = anchor(poses)
         diagonal, gradient = diagonal + of_poses, gradient + of_gradient
-    return diagonal + _WEAK * np.eye(6), below, gradient
+    return diagonal + WEAK * np.eye(6), below, gradient
 
 
 def _by_biases(

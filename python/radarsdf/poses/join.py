@@ -13,18 +13,19 @@ import numpy as np
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.poses.body import MeasuredScans, join_radars
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.odometry import odometry
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
+from radarsdf.poses.refine import FIRST_SIGMAS
 from radarsdf.poses.rigid import aligned
 from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
 JOINED, APART, AMBIGUOUS = "joined", "apart", "ambiguous"
-_FIRST_SIGMAS = 0.1, 0.01  # minimum standard deviations of a step, m and rad
 # Agreement with surfaces of another session, at the best place, from which several places are alike; below, none is the same.
 _ALIKE = 0.5
 
@@ -114,11 +115,8 @@ class _Session:
     def of(cls, session: Scans, config: FitConfig) -> _Session:
         instance(session, Scans, "a session")
         rig, radars = CheckedScans.of_radars(session, None, None)
-        scans: list[Floats] = [np.zeros((0, 3))] * len(session)
-        for rows, checked in radars:
-            for row, scan in zip(rows, checked.scans, strict=True):
-                scans[row] = scan
-        scans = scans if rig is None else rig.in_body(scans)
+        static = [MeasuredScans(rows, checked.scans, checked.times_s, None) for rows, checked in radars]
+        scans = join_radars(rig, static).scans
         poses, rows = session.poses, np.arange(len(session))
         if not np.isfinite(poses).all():
             motion = odometry(session, config=config, progress=False)
@@ -145,7 +143,7 @@ def _refine(
     parts = [(one.returns.directions, one.returns.ranges_m) for one in sessions]
     directions, ranges_m = (np.concatenate(part) for part in zip(*parts, strict=True))
     returns = SensorReturns(directions, ranges_m, np.concatenate(numbers))
-    sigmas = np.max([_FIRST_SIGMAS, *[unsteadiness(one, None) for one in poses]], axis=0).tolist()
+    sigmas = np.max([FIRST_SIGMAS, *[unsteadiness(one, None) for one in poses]], axis=0).tolist()
     motion = Motion.of(before, *sigmas)
     motion.shares[ends[:-1] - 1] = np.inf  # from one session to the next
     cell_m = plane_cell_m([scan for one in sessions for scan in one.scans], config.leaf_size_m)

@@ -17,24 +17,21 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.map.map import Map
 from radarsdf.poses.drive import Drive
-from radarsdf.poses.estimate import PosesEstimate
+from radarsdf.poses.estimate import WEAK, PosesEstimate
 from radarsdf.poses.odometry import track_scans
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.registration import PlaneMap, thin
 from radarsdf.poses.rigid import covariance_in, increments
-from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
+from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_scans
 from radarsdf.poses.tracking import Tracked
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
-_WEAK = 1e-4  # information of a weak prior of a pose, 1/m² and 1/rad²
-_MOST_RETURNS = 2000  # of a scan
 _FINE_CELLS = (
     0.5  # cells of planes for the last estimate: larger ones bend poles and corners, 4 to 17 cm, not 1 to 6
 )
-_PART = 12  # scans whose drift is corrected together
 _FEWEST = 6  # scans to search
 # Least agreement of a part of the drive that is where it seems, relative to that found first. Of a part after a jump of 20 m, fitted to
 # other surfaces: 0.64; of others 0.8 to 1.
@@ -197,7 +194,7 @@ class _Localiser:
         T_map_own[:3, 3] -= self.index.origin
         poses = np.einsum("ij,fjk->fik", T_map_own, poses)
         first = poses[0]
-        thinned = [thin(scan, _MOST_RETURNS) for scan in scans]
+        thinned = [thin(scan) for scan in scans]
         reach_m = float(np.percentile(returns.ranges_m, 99))
         planes = self.index.near(poses[:, :3, 3], 1.5 * reach_m)
         rays = returns.posed(poses)
@@ -212,7 +209,7 @@ class _Localiser:
         near = (0, first, _GUESS_SIGMAS) if guess is not None else (row, poses[row], np.repeat(sigmas, 3))
         anchor = _Anchor.of(self.index, noise, thinned, poses, 1.5 * reach_m, near)
         if len(rows) < 2:
-            information = anchor(poses)[0] + _WEAK * np.eye(6)
+            information = anchor(poses)[0] + WEAK * np.eye(6)
             return rows, poses, np.linalg.inv(information).astype(np.float64), anchor.explained(poses)
         placed = [
             dataclasses.replace(self.tracked[i], pose=pose) for i, pose in zip(rows, poses, strict=True)
@@ -234,7 +231,7 @@ class _Localiser:
         Also returns the scans that agree with the planes as those of the submap do.
         """
         # Parts of several scans: single sparse ones follow wrong planes, and the next ones follow them.
-        found, parts = poses.copy(), np.array_split(np.arange(len(poses)), max(len(poses) // _PART, 1))
+        found, parts = poses.copy(), np.array_split(np.arange(len(poses)), max(len(poses) // SUBMAP_SCANS, 1))
         middle = next(i for i, part in enumerate(parts) if part[-1] >= (submap.start + submap.stop) // 2)
         radius_m = float(np.median(np.linalg.norm(np.concatenate(scans), axis=1)))
         wide = np.diag(np.repeat([planes.capture_m / 2, planes.capture_m / 2 / radius_m], 3) ** 2)
@@ -245,7 +242,7 @@ class _Localiser:
                 own = poses[part[len(part) // 2]]
                 back = np.linalg.inv(own)
                 near = [scans[i] @ (back @ poses[i])[:3, :3].T + (back @ poses[i])[:3, 3] for i in part]
-                points, mean = thin(np.concatenate(near), _MOST_RETURNS), correction @ own
+                points, mean = thin(np.concatenate(near)), correction @ own
                 registered = planes.fit(points, mean, prior)
                 # Along the least certain axis, a step by chance is discounted as its information is.
                 axis, pose = registered.least_certain, registered.pose.copy()

@@ -31,7 +31,7 @@ from radarsdf.threads import ThreadPool
 
 # Minimum initial standard deviations of a step, m and rad. They do not determine the result: measured, 0.1 m and 0.5 degrees
 # converge to the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
-_FIRST_SIGMAS = 0.1, 0.01
+FIRST_SIGMAS = 0.1, 0.01
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def refine_poses(
     if len(scans) < 2 or len(returns) == 0:
         report["verdict"] = "The given poses are kept: there are no two scans to compare."
         return RefinedPoses(given, np.zeros((len(given), 6, 6)), False, report)
-    sigma_m, sigma_rad = np.maximum(_FIRST_SIGMAS, unsteadiness(given, times)).tolist()
+    sigma_m, sigma_rad = np.maximum(FIRST_SIGMAS, unsteadiness(given, times)).tolist()
     motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times)]
     if velocities is not None and times is not None:
         motions.append(DopplerMotion.by(velocities, times, given))

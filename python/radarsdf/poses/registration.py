@@ -17,6 +17,7 @@ _CELLS = 4.0, 2.0  # cell edges, coarse to fine, relative to a map's surfels
 # Along the least certain axis, shifted scans of tunnels have 0.6 to 1.2 times the information, those of nine other kinds of scenes
 # 0.02 to 0.19 times.
 _ITERATIONS, _SETTLED = 8, 0.03  # at each cell size: maximum, tolerance in standard deviations
+_MOST_RETURNS = 2000  # of a scan
 _LEAST_VARIANCE = 1e-12  # of a prior, m² and rad²
 _SHIFTS = 0.0, 1.0, -1.0, 2.0, -2.0  # cells, beyond the extent of single objects
 _SURE = 0.05  # standard deviation of a translation of the prior that needs no returns, cells
@@ -35,7 +36,7 @@ class Registered:
     @property
     def least_certain(self) -> Floats:
         """(3,) axis of the least certain translation."""
-        return np.linalg.eigh(self.covariance[:3, :3])[1][:, -1]
+        return _least_certain(self.covariance)
 
 
 @dataclass
@@ -86,8 +87,8 @@ class PlaneMap:
         """Remove the spurious information along the least certain axis that returns have for any shift of the scan."""
         # In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance.
         cell_m = _CELLS[-1] * self.cell_size_m
-        axis = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
-        before, left = axis @ prior[:3, :3] @ axis, axis @ covariance[:3, :3] @ axis
+        axis = _least_certain(covariance)
+        before, left = (float(axis @ each[:3, :3] @ axis) for each in (prior, covariance))
         if before < (_SURE * cell_m) ** 2:
             return covariance
         chance = self._chance([scan], pose[None], axis)
@@ -117,6 +118,10 @@ class PlaneMap:
         return min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
 
 
+def _least_certain(covariance: Floats) -> Floats:
+    return np.linalg.eigh(covariance[:3, :3])[1][:, -1]
+
+
 def _discount_tilts(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
     """Return Hessians (..., 6, 6) and gradients (..., 6) without the contribution of errors of the normals."""
     # Along a wall, slightly tilted normals would seem to observe the position along it.
@@ -136,6 +141,6 @@ def apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
     return moved_m + radius_m * turned_rad
 
 
-def thin(scan: Floats, most: int) -> Floats:
+def thin(scan: Floats, most: int = _MOST_RETURNS) -> Floats:
     """Subsample a scan evenly to about `most` returns."""
     return np.ascontiguousarray(scan[:: max(1, -(-len(scan) // most))])

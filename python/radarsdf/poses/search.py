@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -36,7 +35,8 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
     "cell_m": (np.float64,),
     "thickness_m": (np.float64,),
 }
-_FIRST_SUBMAP = 12  # scans; doubled until a place is found
+SUBMAP_SCANS = 12
+"""Scans of a submap; doubled until a place is found."""
 _COARSEST_M = 0.8  # largest leaf cell of surfels of a submap
 # Images from above, of steep surfaces: those of a building look alike from each height and tilt.
 _STEEPEST = 0.7  # maximum vertical component of their normals
@@ -214,15 +214,15 @@ class SurfaceIndex:
         pixel_m, radius_m = raster.pixel_m, max(submap.radius_m, raster.pixel_m)
         half = int(np.linalg.norm(points[:, :2], axis=1).max() / pixel_m) + 2
         shape = [fft.next_fast_len(int(n) + 2 * half, real=True) for n in raster.shape]
-        spectra = np.conj(fft.rfft2(images, shape, workers=num_threads))
+        spectra = fft.rfft2(images, shape, workers=num_threads)
         own = _Raster(np.full(2, -half * pixel_m), (2 * half + 1,) * 2, pixel_m)
         yaws = np.arange(0.0, 2 * np.pi, _YAW_PIXELS * pixel_m / radius_m)
         found = []
         for yaw in yaws:
             R = rotation(np.array([0.0, 0.0, yaw]))
             drawn = own.draw(points @ R.T, normals @ R.T)
-            spectrum = (spectra * fft.rfft2(drawn, shape, workers=num_threads)).sum(axis=0)
-            scores = fft.irfft2(np.conj(spectrum), shape, workers=num_threads) / max(drawn[0].sum(), 1.0)
+            spectrum = (spectra * np.conj(fft.rfft2(drawn, shape, workers=num_threads))).sum(axis=0)
+            scores = fft.irfft2(spectrum, shape, workers=num_threads) / max(drawn[0].sum(), 1.0)
             pixels, best = _peaks(scores)
             # Negative shifts of a periodic image are at its end.
             pixels = np.where(pixels > np.array(raster.shape) + half, pixels - shape, pixels) + half
@@ -293,7 +293,7 @@ def search_scans(
 
     Return the transform (4, 4) from the world of the drive to that of the map, and the scans of the part.
     """
-    length, why = _FIRST_SUBMAP, Lost("there are no returns")
+    length, why = SUBMAP_SCANS, Lost("there are no returns")
     while len(returns):
         for first in range(0, max(len(poses) - length // 2, 1), length):
             part = slice(first, min(first + length, len(poses)))
@@ -332,7 +332,8 @@ def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Flo
     lever_m = float(np.median(np.linalg.norm(points, axis=1)))
     others = np.flatnonzero(apart_m(poses, poses[best], lever_m) > planes.capture_m)
     agreeing = float(scores[best].mean())
-    for k in _rivals(scores, best, others, points / (_BLOCK * max(submap.radius_m, 1.0))):
+    k = _rival(scores, best, others, points / (_BLOCK * max(submap.radius_m, 1.0)))
+    if k is not None:
         msg = f"two places of the map fit about equally well: {at[best]} and {at[k]}"
         raise Lost(msg, T_map_own[[best, k]], agreeing)
     covered = index.covers(points @ poses[best][:3, :3].T + poses[best][:3, 3], planes.capture_m).mean()
@@ -365,14 +366,14 @@ def _register(
     return planes, poses
 
 
-def _rivals(scores: Floats, best: int, others: Ints, blocks: Floats) -> Iterator[int]:
-    """Yield the `others` of K poses that points with scores (K, N) in `blocks` (N, 3) do not clearly agree less with."""
+def _rival(scores: Floats, best: int, others: Ints, blocks: Floats) -> int | None:
+    """Return one of the `others` of K poses that points with scores (K, N) in `blocks` (N, 3) do not clearly agree less with."""
     means = scores.mean(axis=1)
+    chance = float(np.median(means[others])) if len(others) else 0.0
     numbers = np.unique(np.floor(blocks), axis=0, return_inverse=True)[1].ravel()
-    for k in others[np.argsort(-means[others])].tolist():
-        chance = float(np.median(means[others]))
-        if not _Evidence.of(scores[best], scores[k], chance, numbers).decides:
-            yield k
+    ranked = others[np.argsort(-means[others])].tolist()
+    clear = (_Evidence.of(scores[best], scores[k], chance, numbers).decides for k in ranked)
+    return next((k for k, decided in zip(ranked, clear, strict=True) if not decided), None)
 
 
 class _Evidence(NamedTuple):

@@ -23,8 +23,6 @@ WINDOW = 25  # scans
 _NOISE_AT = 1, 4, 16, 64  # numbers of scans at which the noise of the sensor is re-estimated
 _NOISE_RETURNS = 10_000  # of the last scans, for this estimate
 
-_MOST_RETURNS = 2000  # of a scan
-
 # Search, where the prediction is less certain than Gauss-Newton requires. Acceptance by a gain over chance alone, or over rivals alone,
 # split three of five recorded drives into more segments.
 _SCORED_RETURNS = 250  # of a scan
@@ -71,7 +69,7 @@ class Tracker:
         """Register a scan (N, 3), sensor frame, m, with the map, near the predicted step. None: the first scan."""
         if predicted is None or not self._scans:
             return begin_segment(np.eye(4))
-        scan = thin(scan, _MOST_RETURNS)
+        scan = thin(scan)
         if len(scan) == 0:
             return self._dead_reckon(predicted)
         radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
