@@ -111,6 +111,22 @@ def test_a_guess_replaces_the_search():
     assert np.median(errors(found.poses, day.poses)[0]) < 0.5
 
 
+def test_a_wrong_guess_is_refused(radar_map, day):
+    guess = moved(day.poses[0], np.array([0.2, -0.2, 0.1, 0.01, 0, 0.03]))
+    right = located(radar_map, day, guess=guess)
+    assert np.median(errors(right.poses, day.poses)[0]) < 0.05
+    for off in ([15.0, 0, 0, 0, 0, 0], [0, -8.0, 0, 0, 0, 0.5], [0, 0, 0, 0, 0, 3.0]):
+        with pytest.raises(radarsdf.Lost, match="guess"):
+            located(radar_map, day, guess=moved(day.poses[0], np.array(off)))
+
+
+def test_a_guess_that_returns_do_not_confirm_is_not_sure(radar_map):
+    other = KINDS["yard"](seed=3, frames=24)
+    found = located(radar_map, other, guess=moved(other.poses[0], np.array([30.0, 0, 0, 0, 0, 0])))
+    assert any("guess" in note for note in found.report["notes"])
+    assert (np.sqrt(np.einsum("fii->fi", found.covariance)[:, :2]) >= 0.5).all()
+
+
 def test_a_kidnapped_radar_is_found_again(first, radar_map):
     early, late = (another_day(first, 1, stretch=part) for part in ((0.0, 0.3), (0.7, 1.0)))
     parts = [measured(one) for one in (early, late)]

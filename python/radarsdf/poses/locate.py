@@ -21,8 +21,8 @@ from radarsdf.poses.estimate import WEAK, PosesEstimate
 from radarsdf.poses.odometry import track_scans
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.registration import PlaneMap, thin
-from radarsdf.poses.rigid import covariance_in, increments
-from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_scans
+from radarsdf.poses.rigid import covariance_in, increments, skew, transform
+from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near, search_scans
 from radarsdf.poses.tracking import Tracked
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
@@ -81,7 +81,8 @@ def locate(
     points : iterable of F arrays, or Scans
         (N_i, 3) each, with `doppler_mps`, `times_s` and `imu` as in :func:`odometry`.
     guess : (4, 4) array_like, optional
-        T_map_sensor of the first scan, to about 0.5 m and 3 degrees, instead of a search for it.
+        T_map_sensor of the first scan, to about 0.5 m and 3 degrees, instead of a search for it. It is tested against the other
+        places of the map. Where the returns cannot tell, a note says so, and the covariances are at least that of the guess.
     config : FitConfig, optional
         Settings, of which ranges, leaf cells and threads are used.
     progress : bool, optional
@@ -95,7 +96,8 @@ def locate(
     Raises
     ------
     Lost
-        If no scan is found: the scans agree with the map nowhere, or in several places, which its `places` are. A ValueError.
+        If no scan is found: the scans agree with the map nowhere, in several places, or clearly better elsewhere than at the
+        guess. These are its `places`. A ValueError.
     TypeError, ValueError
         As :func:`odometry`, and if the map has no surface.
 
@@ -128,7 +130,7 @@ def locate(
         poses, covariance = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
         explained, segments = np.full(count, np.nan), np.full(count, -1)
         why: list[Lost] = []
-        localiser = _Localiser(index, drive, tracked, config, pool.num_threads)
+        localiser = _Localiser(index, drive, tracked, config, pool.num_threads, notes)
         of_scans = np.array([found.segment for found in tracked])
         parts = [np.flatnonzero(of_scans == segment) for segment in range(of_scans[-1] + 1)]
         while parts:
@@ -175,6 +177,7 @@ class _Localiser:
     tracked: list[Tracked]
     config: FitConfig
     num_threads: int
+    notes: list[str]
 
     def locate(self, rows: Ints, guess: Floats | None) -> tuple[Ints, Floats, Floats, Floats]:
         """Return those of the scans `rows` (K,) of a segment that are found together, with poses, covariances and explained shares."""
@@ -185,15 +188,7 @@ class _Localiser:
         if len(returns) == 0:
             msg = "the scans have no returns"
             raise Lost(msg)
-        submap = slice(0, 1)
-        if guess is None:
-            T_map_own, submap = search_scans(self.index, returns, poses, self.num_threads)
-        else:
-            T_map_own = guess @ np.linalg.inv(poses[0])
-        T_map_own = T_map_own.copy()
-        T_map_own[:3, 3] -= self.index.origin
-        poses = np.einsum("ij,fjk->fik", T_map_own, poses)
-        first = poses[0]
+        poses, submap, first, undecided = self._place(returns, poses, guess)
         thinned = [thin(scan) for scan in scans]
         reach_m = float(np.percentile(returns.ranges_m, 99))
         planes = self.index.near(poses[:, :3, 3], 1.5 * reach_m)
@@ -205,12 +200,15 @@ class _Localiser:
         rows, poses, thinned = rows[kept], poses[kept], thinned[kept]
         scans, rig = scans[kept], None if rig is None else rig.select(kept)
         # The place is known to the capture range of the planes: nothing is alike farther away.
-        row, sigmas = (submap.start + submap.stop) // 2 - kept.start, [planes.capture_m, _PLACE_RAD]
-        near = (0, first, _GUESS_SIGMAS) if guess is not None else (row, poses[row], np.repeat(sigmas, 3))
+        row = (submap.start + submap.stop) // 2 - kept.start
+        near = row, poses[row], np.repeat([planes.capture_m, _PLACE_RAD], 3)
+        if first is not None:
+            near = 0, first, _GUESS_SIGMAS
         anchor = _Anchor.of(self.index, noise, thinned, poses, 1.5 * reach_m, near)
         if len(rows) < 2:
             information = anchor(poses)[0] + WEAK * np.eye(6)
-            return rows, poses, np.linalg.inv(information).astype(np.float64), anchor.explained(poses)
+            covariance = np.linalg.inv(information).astype(np.float64)
+            return rows, poses, covariance, anchor.explained(poses)
         placed = [
             dataclasses.replace(self.tracked[i], pose=pose) for i, pose in zip(rows, poses, strict=True)
         ]
@@ -221,7 +219,26 @@ class _Localiser:
         found = PosesEstimate.of(
             returns, poses, motions, cell_m, limits, self.num_threads, len(rows), False, anchor
         )
-        return rows, found.poses, found.covariance, anchor.explained(found.poses)
+        covariance = found.covariance + (_as_guessed(found.poses) if undecided else 0)
+        return rows, found.poses, covariance, anchor.explained(found.poses)
+
+    def _place(
+        self, returns: SensorReturns, poses: Floats, guess: Floats | None
+    ) -> tuple[Floats, slice, Floats | None, bool]:
+        """Move poses (K, 4, 4) to their place in the map, relative to the origin of the index.
+
+        Also returns the scans that were found there, the guess if the place agrees with it, and whether only the guess tells the place.
+        """
+        origin, note, first = transform(np.zeros(3), -self.index.origin), "", None
+        if guess is None:
+            T_map_own, submap = search_scans(self.index, returns, poses, self.num_threads)
+        else:
+            T_map_own, submap = guess @ np.linalg.inv(poses[0]), slice(0, 1)
+            T_map_own, note = search_near(self.index, returns, poses, T_map_own, self.num_threads)
+            self.notes.extend([note] if note else [])
+            if (np.abs(increments(guess, T_map_own @ poses[0])) < 3 * _GUESS_SIGMAS).all():
+                first = origin @ guess
+        return origin @ T_map_own @ poses, submap, first, bool(note)
 
     def _follow(
         self, planes: PlaneMap, scans: list[Floats], poses: Floats, rows: Ints, submap: slice
@@ -258,6 +275,13 @@ class _Localiser:
                 drift = np.sum([self.tracked[rows[i]].covariance for i in part], axis=0)
                 prior = registered.covariance + covariance_in(drift, pose[:3, :3])
         return found, slice(ends[1], ends[0] + 1)
+
+
+def _as_guessed(poses: Floats) -> Floats:
+    """Return the covariances (F, 6, 6) of poses whose place only a guess of the first one tells."""
+    J = np.tile(np.eye(6), (len(poses), 1, 1))
+    J[:, :3, 3:] = -skew(poses[:, :3, 3] - poses[0, :3, 3])
+    return np.einsum("fij,j,fkj->fik", J, _GUESS_SIGMAS**2, J)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -293,22 +294,27 @@ def search_scans(
 
     Return the transform (4, 4) from the world of the drive to that of the map, and the scans of the part.
     """
-    length, why = SUBMAP_SCANS, Lost("there are no returns")
-    while len(returns):
+    why = Lost("there are no returns")
+    for part, submap in _submaps(index, returns, poses, num_threads):
+        try:
+            return search(index, submap, num_threads), part
+        except Lost as lost:
+            why = lost
+    raise why
+
+
+def _submaps(
+    index: SurfaceIndex, returns: SensorReturns, poses: Floats, num_threads: int
+) -> Iterator[tuple[slice, OrientedPoints]]:
+    length = SUBMAP_SCANS // 2
+    while len(returns) and (length < len(poses) or length < SUBMAP_SCANS):
+        length *= 2
         for first in range(0, max(len(poses) - length // 2, 1), length):
             part = slice(first, min(first + length, len(poses)))
             inside = returns.select((returns.scans >= part.start) & (returns.scans < part.stop))
-            if len(inside) == 0:
-                continue
-            submap = OrientedPoints.of_returns(inside, poses, index.cell_m / LEAVES_PER_SURFEL, num_threads)
-            try:
-                return search(index, submap, num_threads), part
-            except Lost as lost:
-                why = lost
-        if length >= len(poses):
-            break
-        length *= 2
-    raise why
+            if len(inside):
+                leaf_m = index.cell_m / LEAVES_PER_SURFEL
+                yield part, OrientedPoints.of_returns(inside, poses, leaf_m, num_threads)
 
 
 def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Floats:
@@ -322,58 +328,132 @@ def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Flo
     if len(starts) == 0:
         msg = "the scans or the map show no steep surface"
         raise Lost(msg)
-    starts[:, :3, 3] += np.einsum("kij,j->ki", starts[:, :3, :3], submap.centre)
-    points = np.random.default_rng(0).permutation(submap.points - submap.centre)[:_REGISTERED]
-    planes, poses = _register(index, submap, points, starts)
-    scores = planes.fine.scores(points, poses, planes.variances)
-    best, T_map_own = int(np.argmax(scores.mean(axis=1))), poses.copy()
-    T_map_own[:, :3, 3] += index.origin - np.einsum("kij,j->ki", poses[:, :3, :3], submap.centre)
-    at = [f"({x:.1f}, {y:.1f})" for x, y in poses[:, :2, 3] + index.origin[:2]]
-    lever_m = float(np.median(np.linalg.norm(points, axis=1)))
-    others = np.flatnonzero(apart_m(poses, poses[best], lever_m) > planes.capture_m)
-    agreeing = float(scores[best].mean())
-    k = _rival(scores, best, others, points / (_BLOCK * max(submap.radius_m, 1.0)))
+    found = _Places.of(index, submap, starts)
+    best = int(np.argmax(found.agreeing))
+    T_map_own, at = found.poses_of_frame, found.names
+    k = found.rival(best)
     if k is not None:
         msg = f"two places of the map fit about equally well: {at[best]} and {at[k]}"
-        raise Lost(msg, T_map_own[[best, k]], agreeing)
-    covered = index.covers(points @ poses[best][:3, :3].T + poses[best][:3, 3], planes.capture_m).mean()
-    if covered < _COVERED or len(others) == 0:
-        msg = f"the map has {covered:.0%} of the surfaces around the best place, {at[best]}, and {_COVERED:.0%} is needed"
-        raise Lost(msg, T_map_own[[best]], agreeing)
+        raise Lost(msg, T_map_own[[best, k]], float(found.agreeing[best]))
+    if found.covered(best) < _COVERED or len(found.elsewhere(best)) == 0:
+        msg = (
+            f"the map has {found.covered(best):.0%} of the surfaces around the best place, {at[best]}, "
+            f"and {_COVERED:.0%} is needed"
+        )
+        raise Lost(msg, T_map_own[[best]], float(found.agreeing[best]))
     return T_map_own[best]
 
 
-def _register(
-    index: SurfaceIndex, submap: OrientedPoints, points: Floats, starts: Floats
-) -> tuple[PlaneMap, Floats]:
-    """Fit the best of poses `starts` (K, 4, 4) of points (N, 3), and the best elsewhere, to planes of the map."""
-    radius_m = max(submap.radius_m, 1.0)
-    reach_m = float(np.linalg.norm(points[:, :2], axis=1).max())
-    planes = index.near(starts[:, :3, 3], reach_m + 4 * index.cell_m)
-    wide_m, few = 0.5 * planes.capture_m, points[:_SCORED]
-    planes.variances = [wide_m**2, *[(wide_m / radius_m) ** 2] * 2]
-    starts = _at_heights(planes, starts, few, index.surface.points[:, 2])
-    means = planes.coarse.scores(few, np.ascontiguousarray(starts), planes.variances).mean(axis=1)
-    rows = np.argsort(-means, kind="stable")
-    elsewhere = rows[apart_m(starts[rows], starts[rows[0]], radius_m) > 3 * _PRIOR_SIGMAS[0]]
-    starts = starts[np.unique(np.concatenate([rows[:_BEST], elsewhere[:_BEST]]))]
-    sigma_m = max(submap.thickness_m, 0.1 * index.cell_m)
-    planes.variances = [sigma_m**2, *[(sigma_m / radius_m) ** 2] * 2]
-    prior, poses = np.diag(np.square(_PRIOR_SIGMAS)), starts
-    for _ in range(_PASSES):
-        pairs = zip(starts, poses, strict=True)
-        poses = np.stack([planes.fit(points, mean, prior, pose).pose for mean, pose in pairs])
-    return planes, poses
+def search_near(
+    index: SurfaceIndex, returns: SensorReturns, poses: Floats, guess: Floats, num_threads: int
+) -> tuple[Floats, str]:
+    """Place a drive with poses (F, 4, 4) near `guess` (4, 4), if it agrees better with the map there than anywhere else.
+
+    Return the transform from the world of the drive to that of the map, and where the returns cannot tell, the guess and a note. Raise
+    Lost if the drive clearly agrees better elsewhere.
+    """
+    note = "The returns do not confirm the guess: the scans or the map show no steep surface."
+    for part, submap in _submaps(index, returns, poses, num_threads):
+        starts = index.candidates(submap, num_threads)
+        if part.start or len(starts) == 0:
+            continue
+        found = _Places.of(index, submap, starts, guess)
+        k = int(np.argmax(found.agreeing))
+        if k in found.elsewhere(0) and found.rival(k) is None and found.covered(k) >= _COVERED:
+            msg = (
+                f"the scans agree better with the map at {found.names[k]} than at the guess, {found.names[0]}"
+            )
+            raise Lost(msg, found.poses_of_frame[[k, 0]], float(found.agreeing[k]))
+        rival = found.rival(0)
+        if rival is None:
+            return found.poses_of_frame[0], ""
+        note = f"The returns do not tell the guess, {found.names[0]}, from {found.names[rival]}."
+    return guess, note
 
 
-def _rival(scores: Floats, best: int, others: Ints, blocks: Floats) -> int | None:
-    """Return one of the `others` of K poses that points with scores (K, N) in `blocks` (N, 3) do not clearly agree less with."""
-    means = scores.mean(axis=1)
-    chance = float(np.median(means[others])) if len(others) else 0.0
-    numbers = np.unique(np.floor(blocks), axis=0, return_inverse=True)[1].ravel()
-    ranked = others[np.argsort(-means[others])].tolist()
-    clear = (_Evidence.of(scores[best], scores[k], chance, numbers).decides for k in ranked)
-    return next((k for k, decided in zip(ranked, clear, strict=True) if not decided), None)
+@dataclass(frozen=True)
+class _Places:
+    """Places of a submap, registered with the planes of a map."""
+
+    index: SurfaceIndex
+    centre: Floats  # (3,) of the submap
+    points: Floats  # (N, 3) of the submap from its centre, m
+    poses: Floats  # (K, 4, 4) of these points, relative to the origin of the index
+    scores: Floats  # (K, N) agreement of each point, in [0, 1]
+    blocks: Ints  # (N,) of points with common errors
+    capture_m: float  # places nearer than that are one
+
+    @classmethod
+    def of(
+        cls, index: SurfaceIndex, submap: OrientedPoints, starts: Floats, guess: Floats | None = None
+    ) -> _Places:
+        """Register the best of the poses `starts` (K, 4, 4), and the best elsewhere. That of a guess becomes the first."""
+        points = np.random.default_rng(0).permutation(submap.points - submap.centre)[:_REGISTERED]
+        starts = _shifted(starts, submap.centre)
+        given = np.zeros((0, 4, 4)) if guess is None else _shifted(guess[None], submap.centre)
+        given[:, :3, 3] -= index.origin
+        radius_m = max(submap.radius_m, 1.0)
+        reach_m = float(np.linalg.norm(points[:, :2], axis=1).max())
+        planes = index.near(np.concatenate([given, starts])[:, :3, 3], reach_m + 4 * index.cell_m)
+        wide_m, few = 0.5 * planes.capture_m, points[:_SCORED]
+        planes.variances = [wide_m**2, *[(wide_m / radius_m) ** 2] * 2]
+        starts = _at_heights(planes, starts, few, index.surface.points[:, 2])
+        means = planes.coarse.scores(few, np.ascontiguousarray(starts), planes.variances).mean(axis=1)
+        rows = np.argsort(-means, kind="stable")
+        elsewhere = rows[apart_m(starts[rows], starts[rows[0]], radius_m) > 3 * _PRIOR_SIGMAS[0]]
+        starts = np.concatenate([given, starts[np.unique([*rows[:_BEST], *elsewhere[:_BEST]])]])
+        sigma_m = max(submap.thickness_m, 0.1 * index.cell_m)
+        planes.variances = [sigma_m**2, *[(sigma_m / radius_m) ** 2] * 2]
+        prior, poses = np.diag(np.square(_PRIOR_SIGMAS)), starts
+        for _ in range(_PASSES):
+            pairs = zip(starts, poses, strict=True)
+            poses = np.stack([planes.fit(points, mean, prior, pose).pose for mean, pose in pairs])
+        blocks = np.unique(np.floor(points / (_BLOCK * radius_m)), axis=0, return_inverse=True)[1].ravel()
+        scores = planes.fine.scores(points, poses, planes.variances)
+        return cls(index, submap.centre, points, poses, scores, blocks, planes.capture_m)
+
+    @cached_property
+    def agreeing(self) -> Floats:
+        """(K,) mean agreement."""
+        return self.scores.mean(axis=1)
+
+    @property
+    def names(self) -> list[str]:
+        return [f"({x:.1f}, {y:.1f})" for x, y in self.poses[:, :2, 3] + self.index.origin[:2]]
+
+    @property
+    def poses_of_frame(self) -> Floats:
+        """(K, 4, 4) from the frame of the submap to the world of the map."""
+        poses = _shifted(self.poses, -self.centre)
+        poses[:, :3, 3] += self.index.origin
+        return poses
+
+    def elsewhere(self, place: int) -> Ints:
+        """Return the other places, best first."""
+        lever_m = float(np.median(np.linalg.norm(self.points, axis=1)))
+        others = np.flatnonzero(apart_m(self.poses, self.poses[place], lever_m) > self.capture_m)
+        return others[np.argsort(-self.agreeing[others])]
+
+    def covered(self, place: int) -> float:
+        """Return the share of the points that have a surface of the map near them."""
+        pose = self.poses[place]
+        return float(self.index.covers(self.points @ pose[:3, :3].T + pose[:3, 3], self.capture_m).mean())
+
+    def rival(self, place: int) -> int | None:
+        """Return another place with which the submap does not clearly agree less."""
+        return next((k for k in self.elsewhere(place) if not self.evidence(place, k).decides), None)
+
+    def evidence(self, place: int, other: int) -> _Evidence:
+        others = self.elsewhere(place)
+        chance = float(np.median(self.agreeing[others])) if len(others) else 0.0
+        return _Evidence.of(self.scores[place], self.scores[other], chance, self.blocks)
+
+
+def _shifted(poses: Floats, shift: Floats) -> Floats:
+    """Return poses (K, 4, 4) of a frame whose origin is shifted by (3,)."""
+    poses = poses.copy()
+    poses[:, :3, 3] += np.einsum("kij,j->ki", poses[:, :3, :3], shift)
+    return poses
 
 
 class _Evidence(NamedTuple):
