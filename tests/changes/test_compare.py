@@ -14,6 +14,8 @@ from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
+from scenes.revisits import another_day
+
 from .conftest import QUICK, drives_past
 
 TAKEN, PUT = np.array([2.5, 2.5, 0.5]), np.array([2.5, -3.0, 0.5])
@@ -85,6 +87,16 @@ def test_maps_of_different_frames_are_aligned_first(drives, maps):
     x = np.append(PUT, 1)
     # The offset along the wall is unobservable.
     assert np.abs(found.T_before_after @ apart @ x - x)[[0, 2]].max() < 0.1
+
+
+def test_maps_of_unrelated_frames_are_compared():
+    first = radarsdf.simulate.oculii(seed=1, frames=40)
+    day, apart = another_day(first, 1), transform(np.array([0.0, 0.0, 2.0]), np.array([50.0, 20.0, 3.0]))
+    before = radarsdf.fit(first.points, first.poses, config=QUICK)
+    found = radarsdf.compare(before, day.points, apart @ day.poses)
+    np.testing.assert_allclose((found.T_before_after @ apart)[:3, :3], np.eye(3), atol=0.01)
+    moved_m = (found.T_before_after @ apart @ day.poses - day.poses)[:, :3, 3]
+    np.testing.assert_allclose(moved_m, 0, atol=0.05)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2, qmc
@@ -12,9 +12,12 @@ from radarsdf.arrays import Floats, Ints
 from radarsdf.changes.probability import PARALLEL, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.map.threshold import across_triangles
 from radarsdf.poses.rigid import moved, rotation_vector, skew
+from radarsdf.poses.search import Lost, OrientedPoints, SurfaceIndex, search
 from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
+from radarsdf.returns.planes import LEAVES_PER_SURFEL
+from radarsdf.threads import resolve_num_threads
 
 # Prior standard deviations of the offset between the frames of two maps: translation, m, and rotation vector, rad.
 _PRIOR_SIGMAS = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
@@ -62,23 +65,33 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
         return np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
 
+    def nearer(first: Floats, second: Floats) -> bool:
+        return Verdict.by_groups(far(first) - far(second), surface.patches).improved
+
+    own, T_near = surface, np.eye(4)
     found = _constrained_pose(before, surface, np.eye(4))
     searched = _constrained_pose(before, surface, _coarse_pose(before, surface))
-    if Verdict.by_groups(far(found[0]) - far(searched[0]), surface.patches).improved:
+    if nearer(found[0], searched[0]):
         found = searched
+    place = _place(before, after)
+    if place is not None:
+        searched = _constrained_pose(before, surface.placed(place), np.eye(4))
+        if nearer(found[0], searched[0] @ place):
+            found, own, T_near = searched, surface.placed(place), place
     pose, covariance, undetermined = found
-    offset = surface.offset(pose)
+    offset, pose = own.offset(pose), pose @ T_near
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
     by_chance = np.sqrt(chi2.isf(_SIGNIFICANCE, len(offset)))
-    if sigmas <= by_chance or far(pose).mean() >= far(np.eye(4)).mean():
+    if (own is surface and sigmas <= by_chance) or far(pose).mean() >= far(np.eye(4)).mean():
         words = "The frames were taken as they are: surfaces do not show an offset between them."
-        return Alignment(covariance=covariance, centre=surface.centre, words=words)
+        return Alignment(covariance=covariance, centre=own.centre, words=words)
     moved_m = np.sqrt(((_transformed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
+    how = f"{sigmas:.1f} standard errors" if own is surface else "to the only place where it fits"
     words = (
-        f"The later map was moved by {moved_m:.3f} m, {sigmas:.1f} standard errors; "
+        f"The later map was moved by {moved_m:.3f} m, {how}; "
         f"surfaces do not determine {undetermined} of 6 axes, along which its pose was kept."
     )
-    return Alignment(pose, covariance, surface.centre + offset[:3], True, words)
+    return Alignment(pose, covariance, own.centre + offset[:3], True, words)
 
 
 @dataclass(frozen=True)
@@ -109,6 +122,11 @@ class _Surface:
         radius_m = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
         return cls(points, normals, sigma_m, patches, centre, radius_m)
 
+    def placed(self, pose: Floats) -> _Surface:
+        """Move the surface by a pose (4, 4)."""
+        points, normals = _transformed(self.points, pose), turned(self.normals, pose[:3, :3])
+        return replace(self, points=points, normals=normals, centre=points.mean(axis=0))
+
     def offset(self, pose: Floats) -> Floats:
         """(6,) translation of the centre, m, and rotation vector, rad, of a pose (4, 4)."""
         shift = np.einsum("ij,j->i", pose[:3, :3], self.centre) + pose[:3, 3] - self.centre
@@ -119,6 +137,22 @@ class _Surface:
         found: Floats = moved(np.eye(4)[None], offset[None])[0]
         found[:3, 3] += self.centre - np.einsum("ij,j->i", found[:3, :3], self.centre)
         return found
+
+
+def _place(before: PlacedMap, after: PlacedMap) -> Floats | None:
+    """Search the whole earlier surface for the later one, if its frame is another; no prior limits the offset."""
+    earlier, later = (
+        OrientedPoints(placed.vertices, placed.normals, float(np.nanmedian(placed.sigma_m)))
+        for placed in (before, after)
+    )
+    origin = earlier.centre
+    index = SurfaceIndex(
+        replace(earlier, points=earlier.points - origin), LEAVES_PER_SURFEL * before.leaf_m, origin
+    )
+    try:
+        return search(index, later, resolve_num_threads(before.radar_map.config.num_threads))
+    except Lost:
+        return None
 
 
 def _coarse_pose(before: PlacedMap, surface: _Surface) -> Floats:

@@ -69,8 +69,8 @@ def compare(
         For new scans: sensor units.
     align_frames : bool
         Whether to align the later map as a whole, if its surface shows an offset between the frames at a significance
-        level of 0.001; offsets may be some metres and some degrees. Along axes that the surfaces do not determine, such as
-        along a single wall, the frame is kept.
+        level of 0.001. Offsets may be some metres and some degrees, and any where the later map fits in one place alone, as
+        :func:`locate` would find it. Along axes that the surfaces do not determine, such as along a single wall, the frame is kept.
     box : (2, 3) array_like, optional
         Lower and upper corner, world of the earlier map, m: nothing outside is returned.
     progress : bool, optional
