@@ -139,8 +139,15 @@ def test_scans_are_located_in_a_map(drive, motion, tmp_path, capsys):
     found = values(capsys, "locate", tmp_path / "map.safetensors", tmp_path / "drive.npz", "-o", out)
     assert found["found"] == FRAMES
     assert np.abs(np.loadtxt(out)[:, 1:4] - drive.poses[:, :3, 3]).max() < 0.1
-    near = ["--guess", *drive.poses[0, :3, 3], 0]
-    assert call("locate", tmp_path / "map.safetensors", tmp_path / "drive.npz", "-o", out, *near) == 0
+    page, there = tmp_path / "page.html", (tmp_path / "map.safetensors", tmp_path / "drive.npz")
+    shown = values(capsys, "report", *there, "--locate", "-o", page)
+    assert shown["found"] == FRAMES
+    assert page.stat().st_size == shown["report_bytes"]
+    assert refusal(capsys, tmp_path, "report", there[0], "--locate", "-o", page, status=2)
+    yaw_deg = np.degrees(np.arctan2(drive.poses[0, 1, 0], drive.poses[0, 0, 0]))
+    near = ["--guess", *drive.poses[0, :3, 3]]
+    assert call("locate", *there, "-o", out, *near, yaw_deg) == 0
+    assert "guess" in refusal(capsys, tmp_path, "locate", *there, "-o", out, *near, yaw_deg + 180)
 
 
 def test_sessions_are_joined_in_a_folder(drive, motion, tmp_path, capsys):

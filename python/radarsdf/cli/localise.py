@@ -7,6 +7,7 @@ from argparse import Namespace
 import numpy as np
 
 import radarsdf
+from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.cli.inputs import inputs_of, load_map, read_scans
 from radarsdf.cli.options import refuse_if
@@ -16,40 +17,52 @@ from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.npz import write_scans
 from radarsdf.io.poses import POSE_SUFFIXES, UNPOSED, NoPoses, check_pose_times, write_poses
 from radarsdf.io.read import read
+from radarsdf.map.map import Map
 from radarsdf.poses.rigid import transform
+from radarsdf.scans import Scans
 
 
 def locate(given: Namespace, results: Results) -> None:
     """Localise the scans in the map, print what was found, and write the poses of the scans that were."""
     out = given.out
-    refuse_if(given.poses, f"locate does not use poses: leave out {given.poses}")
     as_scans = out.suffix.lower() == ".npz"
     if not as_scans:
         checked_suffix(out, POSE_SUFFIXES, "poses to write")
     check_outputs([out], inputs_of(given))
-    scans = read_scans(given, UNPOSED)
-    if not as_scans:
-        check_pose_times(out, scans.times_s)
     guess = None
     if given.guess is not None:
         *position, yaw_deg = given.guess
         guess = transform(np.array([0.0, 0.0, np.radians(yaw_deg)]), np.array(position))
-    found = radarsdf.locate(load_map(given.map), scans, guess=guess)
+    scans = unposed_scans(given)
+    if not as_scans:
+        check_pose_times(out, scans.times_s)
+    placed = located(load_map(given.map), scans, results, guess)
+    if as_scans:
+        write_scans(out, placed)
+    else:
+        what = f"{len(scans) - len(placed)} scans are lost, but {out} cannot tell which: write .tum or .npz"
+        check(len(placed) == len(scans) or out.suffix.lower() == ".tum", what)
+        write_poses(out, placed.poses, placed.times_s)
+    results.add_file(f"{len(placed)} poses", out)
+
+
+def unposed_scans(given: Namespace) -> Scans:
+    """Read scans that are to be localised."""
+    refuse_if(given.poses, f"scans that are localised need no poses: leave out {given.poses}")
+    return read_scans(given, UNPOSED)
+
+
+def located(radar_map: Map, scans: Scans, results: Results, guess: Floats | None = None) -> Scans:
+    """Return the scans that are found in the map, with their poses there, and print which."""
+    found = radarsdf.locate(radar_map, scans, guess=guess)
     report = found.report
     for note in report["notes"]:
         warn(f"note: {note}")
     results.add(report["verdict"], **report, explained=found.explained, segments=found.segments)
     for why in report["lost"]:
         results.add(f"lost: {why}")
-    rows = np.flatnonzero(found.segments >= 0)
-    placed = scans.with_poses(np.nan_to_num(found.poses), other_world=True).select(rows)
-    if as_scans:
-        write_scans(out, placed)
-    else:
-        what = f"{len(scans) - len(rows)} scans are lost, but {out} cannot tell which: write .tum or .npz"
-        check(len(rows) == len(scans) or out.suffix.lower() == ".tum", what)
-        write_poses(out, placed.poses, placed.times_s)
-    results.add_file(f"{len(rows)} poses", out)
+    placed = scans.with_poses(np.nan_to_num(found.poses), other_world=True)
+    return placed.select(np.flatnonzero(found.segments >= 0))
 
 
 def join(given: Namespace, results: Results) -> None:
