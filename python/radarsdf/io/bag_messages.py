@@ -93,7 +93,8 @@ class Message(NamedTuple):
 
 
 @cache
-def _types(cdr: bool) -> Any:
+def message_types(cdr: bool) -> Any:
+    """Return the types of rosbags, of ROS 2 or else of ROS 1."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - an extra
 
     store = get_typestore(Stores.ROS2_HUMBLE if cdr else Stores.ROS1_NOETIC)
@@ -251,6 +252,13 @@ def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, T
     return {n: topic for n, topic in topics.items() if topic.message_type in types and topic.num_messages}
 
 
+def decode(raw: Any, message_type: str, *, cdr: bool = True) -> tuple[float, str, Any]:
+    """Return time, s, frame and content of the bytes of a message of ROS 2, or else of ROS 1."""
+    types = message_types(cdr)
+    message = (types.deserialize_cdr if cdr else types.deserialize_ros1)(raw, message_type)
+    return *_stamp(message), _READERS[message_type](message)
+
+
 def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
     """Yield the messages of some topics in the order of recording; damaged ones are left out, and noted at the end."""
     numbers: Counter[str] = Counter()
@@ -260,16 +268,13 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
         for recorded_s, path, connection, raw in heapq.merge(*streams, key=itemgetter(0)):
             topic, message_type = connection.topic, connection.msgtype
             number, numbers[topic] = numbers[topic], numbers[topic] + 1
-            cdr = hasattr(connection.ext, "serialization_format")
             try:
-                types = _types(cdr)
-                message = (types.deserialize_cdr if cdr else types.deserialize_ros1)(raw, message_type)
-                content = _READERS[message_type](message)
+                decoded = decode(raw, message_type, cdr=hasattr(connection.ext, "serialization_format"))
             except Exception as error:  # noqa: BLE001 - damaged messages raise exceptions of many kinds
                 at = f"message {number} of {topic}, at {recorded_s:.3f} s"
                 damaged.setdefault(topic, []).append(f"{path}: {at}, no complete {message_type}: {error}")
                 continue
-            yield Message(path, topic, message_type, recorded_s, number, *_stamp(message), content)
+            yield Message(path, topic, message_type, recorded_s, number, *decoded)
     for topic, texts in damaged.items():
         notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
 

@@ -47,6 +47,9 @@ class Track:
     static: bool = False
     numbers: array[float] = field(default_factory=lambda: array("d"))  # stamp, record time, pose
 
+    def add(self, numbers: tuple[float, ...]) -> None:
+        self.numbers.extend(numbers)
+
     @cached_property
     def table(self) -> Floats:
         """(P, 9) the usable poses: finite, with a unit quaternion."""
@@ -174,6 +177,41 @@ def _held_corrections(slow: Trajectory, below: Trajectory, track: Track, request
     return replace(slow, held=True)
 
 
+class Tracks:
+    """The poses of messages so far, by topic, and the transforms of TF."""
+
+    def __init__(self, make: type[Track] = Track) -> None:
+        self.by_topic: dict[str, Track] = {}
+        self._parents: dict[str, dict[str, Track]] = {}  # by child and parent frame
+        self._make = make
+
+    def add(self, message: bag_messages.Message) -> None:
+        if message.message_type == bag_messages.PATH:
+            self.by_topic.pop(message.topic, None)  # each holds the whole path so far: the last one is used
+        static = "static" in message.topic  # /tf_static: transforms that hold for all times
+        for pose in message.content:
+            tracks, key = self.by_topic, message.topic
+            if message.message_type in bag_messages.TRANSFORM_TYPES:
+                tracks, key = self._parents.setdefault(pose.child, {}), pose.parent
+            track = tracks.setdefault(key, self._make(pose.parent, pose.child, static))
+            track.add((pose.stamp_s, message.recorded_s, *pose.values))
+
+    def tree(self, request: Request) -> TransformTree:
+        """Tree of the transforms. Of a frame with several parents, one is chosen and noted."""
+        edges = {}
+        for child, tracks in self._parents.items():
+            options = [track for track in tracks.values() if len(track.table)]
+            if options:
+                wanted = (request.world_frame or "").lstrip("/")
+                ranks = [
+                    (t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1)) for t in options
+                ]
+                edges[child] = options[ranks.index(max(ranks))]
+            if len(options) > 1:
+                request.notes.add(f"{child} has several parents in TF: {edges[child].parent} is used")
+        return TransformTree(edges)
+
+
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
     topics = topics_with(bag_messages.TRANSFORM_TYPES, bag_messages.topics_of(paths))
     return _tracks_and_tree(paths, set(), set(topics), request)[1]
@@ -193,7 +231,7 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
     name, find = "" if wants_tf else wanted or _choose(tracks, tree, sensor, preferred), None
     try:
-        find = None if name else _tree_poses(tree, sensor, request)
+        find = None if name else tree_poses(tree, sensor, request)
     except ValueError:
         if wants_tf or not tracks:
             raise
@@ -204,36 +242,18 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     for other in sorted(fitting - {name}):
         notes.add(f"poses of {other} are ignored; pose_topic selects them")
     check(find or name in tracks, f"{paths[0]}: {name} holds no poses")
-    return find or _topic_poses(name, tracks, tree, sensor, request)
+    return find or topic_poses(name, tracks, tree, sensor, request)
 
 
 def _tracks_and_tree(
     paths: list[Path], pose_topics: set[str], transform_topics: set[str], request: Request
 ) -> tuple[dict[str, Track], TransformTree]:
     """Read the poses of `pose_topics` and the transforms in one pass through the bags. Topics with a single pose are left out."""
-    by_topic: dict[str, Track] = {}
-    parents: dict[str, dict[str, Track]] = {}
+    tracks = Tracks()
     for message in bag_messages.read_messages(paths, pose_topics | transform_topics, request.notes):
-        if message.message_type == bag_messages.PATH:
-            by_topic.pop(message.topic, None)  # each holds the whole path so far: the last one is used
-        static = "static" in message.topic  # /tf_static: transforms that hold for all times
-        for pose in message.content:
-            tracks, key = by_topic, message.topic
-            if message.topic in transform_topics:
-                tracks, key = parents.setdefault(pose.child, {}), pose.parent
-            track = tracks.setdefault(key, Track(pose.parent, pose.child, static))
-            track.numbers.extend((pose.stamp_s, message.recorded_s, *pose.values))
-    edges = {}
-    for child, tracks in parents.items():
-        options = [track for track in tracks.values() if len(track.table)]
-        if options:
-            wanted = (request.world_frame or "").lstrip("/")
-            ranks = [(t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1)) for t in options]
-            edges[child] = options[ranks.index(max(ranks))]
-        if len(options) > 1:
-            request.notes.add(f"{child} has several parents in TF: {edges[child].parent} is used")
-    moving = {n: track for n, track in by_topic.items() if len(np.unique(track.table[:, :2], axis=0)) > 1}
-    return moving, TransformTree(edges)
+        tracks.add(message)
+    moving = {n: t for n, t in tracks.by_topic.items() if len(np.unique(t.table[:, :2], axis=0)) > 1}
+    return moving, tracks.tree(request)
 
 
 def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferred: str | None) -> str:
@@ -246,7 +266,7 @@ def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferre
     return leading[0] if len(leading) == 1 else ""
 
 
-def _topic_poses(
+def topic_poses(
     name: str, tracks: Mapping[str, Track], tree: TransformTree, sensor: str, request: Request
 ) -> FindPoses:
     """Poses of a topic: of the frame that it names, or else of the one that moves with the sensor."""
@@ -269,7 +289,7 @@ def _topic_poses(
     return tree.attach(trajectory, base, request)
 
 
-def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
+def tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about, moving = request.notes.about, tree.moving
     if not moving:
