@@ -2,19 +2,7 @@
 
     python examples/live.py
 
-With ROS 2, the callback belongs to a subscription:
-
-    class Mapper(rclpy.node.Node):
-        def __init__(self):
-            super().__init__("mapper")
-            self.live = radarsdf.LiveMap()
-            self.create_subscription(PointCloud2, "/radar/points", self.on_scan, 10)
-
-        def on_scan(self, message):
-            fields = point_cloud2.read_points(message, ["x", "y", "z", "power", "doppler"])
-            points = np.stack([fields[name] for name in "xyz"], axis=1)
-            stamp = message.header.stamp
-            self.live.integrate(points, self.pose_at(stamp), fields["power"], doppler_mps=fields["doppler"])
+With ROS 2: ros2_node.py.
 """
 
 from __future__ import annotations

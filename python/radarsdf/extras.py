@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 REQUIREMENTS = {
+    "cyclonedds": "cyclonedds>=11",
     "distributed": "distributed>=2024.8",
     "foxglove": "foxglove-sdk>=0.30",
     "laspy": "laspy[lazrs]>=2.5",

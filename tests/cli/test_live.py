@@ -86,10 +86,12 @@ def test_sinks_get_all_scans_and_periodically_the_surface():
     sink, mesh = Mock(), Mock(faces=[0])
     scans = Scans(SCENE.points, SCENE.poses, None)
     growing = Mock(**{"mesh.return_value": mesh, "config.returns.free_space": False})
-    shown = _Shown(growing, scans, [sink])
-    for i, (due, times) in enumerate([(True, 1), (False, 1), (True, 2)]):
+    shown = _Shown(growing, None, [sink])
+    cases = (True, 1), (False, 1), (True, 2)
+    for i, ((due, times), scan) in enumerate(zip(cases, scans, strict=False)):
         shown._next_s = 0.0 if due else shown._next_s
-        shown(Replay(0.1 * np.arange(6), list(range(i + 1)), list(SCENE.poses[: i + 1])))
+        done = Replay([0.0, 0.1, 0.2], rows=list(range(i + 1)), poses=list(SCENE.poses[: i + 1]))
+        shown(done, scan)
         shown._thread.join()
         assert sink.show_surface.call_count == times
     assert [call.args[1] for call in sink.show_scan.call_args_list] == [0.0, 0.1, 0.2]

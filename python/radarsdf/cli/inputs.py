@@ -8,11 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from radarsdf.checks import check_pose
 from radarsdf.cli.options import GROUPS, LIMITS, refuse_if
 from radarsdf.cli.results import warn
 from radarsdf.evaluation import holdout
 from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
+from radarsdf.io.recordings import Request
 from radarsdf.io.text import read_numbers
 from radarsdf.map.map import Map
 from radarsdf.scans import Notes, Scans
@@ -37,23 +39,56 @@ def load_map(path: Path) -> Map:
 
 def read_scans(given: Namespace, poses: StampedPoses | None = None) -> Scans:
     """Read the scans, with `poses` instead of theirs if passed. Assumptions and omissions are logged on standard error."""
-    fields = [text.partition("=") for text in given.field or ()]
-    for role, _, name in fields:
-        refuse_if(not (role and name), f"--field takes ROLE=NAME, not {role!r:.50}")
     columns = given.columns
-    names = ("topic", "pose_topic", "imu_topic", "world_frame", "stamps")
-    extrinsic = given.extrinsic and read_numbers(given.extrinsic, 4)
+    names = ("topic", "pose_topic", "imu_topic")
     rotation = given.imu_rotation and read_numbers(given.imu_rotation, 3)
     return read(
         given.scans,
         given.poses if poses is None else poses,
-        extrinsic=extrinsic,
         R_sensor_imu=rotation,
-        fields={role: name for role, _, name in fields} or None,
         columns=int(columns) if columns and columns.isdecimal() else columns and columns.split(","),
-        max_gap_s=given.max_gap,
+        **_roles_and_frames(given),
         **{name: getattr(given, name) for name in names},
     )
+
+
+def _roles_and_frames(given: Namespace) -> dict[str, Any]:
+    """Arguments of :func:`radarsdf.io.read` that topics of running nodes need, too."""
+    fields = [text.partition("=") for text in given.field or ()]
+    for role, _, name in fields:
+        refuse_if(not (role and name), f"--field takes ROLE=NAME, not {role!r:.50}")
+    return {
+        "extrinsic": given.extrinsic and read_numbers(given.extrinsic, 4),
+        "fields": {role: name for role, _, name in fields} or None,
+        "max_gap_s": given.max_gap,
+        "world_frame": given.world_frame,
+        "stamps": given.stamps,
+    }
+
+
+def request_of_topics(given: Namespace) -> Request | None:
+    """Check the options of running topics; None if there are none."""
+    one = bool(given.ros2) != (given.scans is not None)
+    refuse_if(not one, "give either a recording or, as --ros2 TOPIC, topics of running nodes")
+    refuse_if(
+        given.scans and (given.ros2_odom or given.ros2_domain), "--ros2-odom and --ros2-domain need --ros2"
+    )
+    if given.scans:
+        return None
+    for option in ("--topic", "--pose-topic", "--imu-topic", "--imu-rotation", "--columns"):
+        value = vars(given)[option.lstrip("-").replace("-", "_")]
+        refuse_if(value is not None, f"--ros2 reads no file: {option} {value} would have no effect")
+    refuse_if(given.rate != 1, f"--ros2 maps scans as they come: --rate {given.rate} would have no effect")
+    wrong = [topic for topic in (*given.ros2, given.ros2_odom or "/") if not topic.startswith("/")]
+    refuse_if(wrong, f"the name of a topic begins with /, unlike {wrong}")
+    refuse_if(
+        given.find and given.ros2_odom, f"with --find, --ros2-odom {given.ros2_odom} would have no effect"
+    )
+    refuse_if(not 0 <= given.ros2_domain <= 230, f"--ros2-domain must be 0 to 230, not {given.ros2_domain}")
+    arguments = _roles_and_frames(given)
+    if given.extrinsic:
+        arguments["extrinsic"] = check_pose(arguments["extrinsic"], "extrinsic T_base_sensor")
+    return Request(**arguments, pose_topic=given.ros2_odom, notes=Notes("the topics"))
 
 
 def scans_or_unposed(given: Namespace, *, find: bool = False) -> tuple[Scans, bool]:

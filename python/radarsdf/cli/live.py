@@ -1,4 +1,4 @@
-"""``radarsdf live``: replay a recording as if its scans arrived now."""
+"""``radarsdf live``: replay a recording as if its scans arrived now, or map running ROS 2 topics."""
 
 from __future__ import annotations
 
@@ -6,26 +6,29 @@ import contextlib
 import threading
 import time
 from argparse import Namespace
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
-from radarsdf.cli.inputs import inputs_of, scans_or_unposed
+from radarsdf.cli.inputs import inputs_of, request_of_topics, scans_or_unposed
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, until_stopped
+from radarsdf.cli.results import Results, until_stopped, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.grids.occupancy import grid as grid_of
+from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
+from radarsdf.io.ros2 import Node, Subscription
 from radarsdf.live.live_map import LiveMap
 from radarsdf.poses.search import Lost
+from radarsdf.rig import Label
 from radarsdf.scans import Scan, Scans
 from radarsdf.view.pages import GrowingView
 from radarsdf.view.serving import url_of, wait
-from radarsdf.view.sinks import Sink, foxglove_sink, rerun_sink
+from radarsdf.view.sinks import Ros2Sink, Sink, foxglove_sink, rerun_sink
 
 _SHOWN_EVERY_S = 0.5
 _GRID_SHARE = 0.05  # share of the time spent on free space, for which a map is fitted anew
@@ -36,7 +39,8 @@ _MAX_VOXELS = 500_000
 class Replay:
     """Results of a replay: indices of integrated scans with their poses and seconds, and of the others."""
 
-    times_s: Floats  # of all scans
+    times_s: list[float] = field(default_factory=list)  # of all scans
+    timed: bool = True  # by the recording, and not 0.1 s per scan
     rows: list[int] = field(default_factory=list)
     poses: list[Floats] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
@@ -47,18 +51,52 @@ class Replay:
 
 def replay(
     live: LiveMap,
-    scans: Scans,
+    scans: Scans | Subscription,
     *,
     with_poses: bool = True,
     rate: float = 1.0,
-    on_scan: Callable[[Replay], None] | None = None,
+    on_scan: Callable[[Replay, Scan], None] | None = None,
 ) -> Replay:
     """Integrate scans at `rate` times the recorded speed; 0: as fast as possible. A scan is dropped once the next one arrives."""
-    count = len(scans.points)
-    done = Replay(np.asarray(0.1 * np.arange(count) if scans.times_s is None else scans.times_s))
-    due_s = (done.times_s - done.times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
-    labels = None if scans.T_body_sensor is None else scans.sensors
+    done = Replay()
     first = 1 + max((known for known in live.scan_ids if isinstance(known, int)), default=-1)
+    # A node goes on after a scan that does not fit, such as one with a repeated time.
+    unusable = Lost if isinstance(scans, Scans) else ValueError
+    for i, scan in _due(scans, rate, done) if isinstance(scans, Scans) else _arriving(scans, done):
+        started = time.perf_counter()
+        try:
+            found = live.integrate(
+                scan.points,
+                scan.T_world_sensor if with_poses else None,
+                scan.intensities,
+                doppler_mps=scan.doppler_mps,
+                time_s=scan.time_s,
+                scan_id=first + i,
+                sensor=scan.sensor,
+            )
+        except unusable as error:
+            done.lost.append(i)
+            done.notes = done.notes if done.rows else (str(error),)
+            continue
+        done.seconds.append(time.perf_counter() - started)
+        done.rows.append(i)
+        done.poses.append(found.pose)
+        done.notes = found.notes
+        for k, row in enumerate(done.rows if found.moved else ()):
+            if first + row in found.moved:
+                done.poses[k] = live.pose(first + row)
+        if on_scan is not None:
+            on_scan(done, scan)
+    return done
+
+
+def _due(scans: Scans, rate: float, done: Replay) -> Iterator[tuple[int, Scan]]:
+    """Yield the scans that are not dropped when they are due, with their poses of a body, and labels of mounted radars."""
+    count = len(scans.points)
+    times_s = np.asarray(0.1 * np.arange(count) if scans.times_s is None else scans.times_s)
+    done.times_s, done.timed = times_s.tolist(), scans.times_s is not None
+    due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
+    labels = None if scans.T_body_sensor is None else scans.sensors
     begin = time.perf_counter()
     for i in range(count):
         now = time.perf_counter() - begin
@@ -66,98 +104,109 @@ def replay(
             done.dropped.append(i)
             continue
         time.sleep(max(due_s[i] - now, 0.0))
-        started = time.perf_counter()
-        try:
-            found = live.integrate(
+        yield (
+            i,
+            Scan(
                 scans.points[i],
-                scans.poses[i] if with_poses else None,
+                scans.poses[i],
                 None if scans.intensities is None else scans.intensities[i],
-                doppler_mps=None if scans.doppler_mps is None else scans.doppler_mps[i],
-                time_s=float(done.times_s[i]),
-                scan_id=first + i,
+                None if scans.doppler_mps is None else scans.doppler_mps[i],
+                done.times_s[i],
                 sensor=None if labels is None else labels[i],
-            )
-        except Lost:
-            done.lost.append(i)
-            continue
-        done.seconds.append(time.perf_counter() - started)
-        done.rows.append(i)
-        done.poses.append(found.pose)
-        done.notes = found.notes
-        for k, row in enumerate(done.rows):
-            if first + row in found.moved:
-                done.poses[k] = live.pose(first + row)
-        if on_scan is not None:
-            on_scan(done)
-    return done
+            ),
+        )
+
+
+def _arriving(scans: Subscription, done: Replay) -> Iterator[tuple[int, Scan]]:
+    for i, scan in enumerate(scans):
+        done.times_s.append(scan.time_s or 0.0)
+        yield i, scan
+    done.dropped = [-1] * scans.dropped  # these have no index
 
 
 def live(given: Namespace, results: Results) -> None:
-    """Replay the scans, report whether the map kept up, and write it."""
+    """Replay the scans or map those of running topics, report whether the map kept up, and write it."""
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
+    request = request_of_topics(given)
     out, trajectory = given.out, given.trajectory
     if trajectory is not None:
         checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
     check_outputs([out, trajectory, given.mcap, given.rrd], inputs_of(given))
     with contextlib.ExitStack() as servers, contextlib.ExitStack() as files:
-        sinks: list[Sink] = []
-        urls: list[str] = []
-        if given.view:
-            page = servers.enter_context(GrowingView(host=given.host, port=given.port))
-            sinks, urls = [page], [url_of(page.host, page.port)]
-        of_viewers = (foxglove_sink, given.foxglove, given.mcap), (rerun_sink, given.rerun, given.rrd)
-        for open_sink, served, path in of_viewers:
-            if served:
-                sink, url = servers.enter_context(open_sink(None))
-                sinks, urls = [*sinks, sink], [*urls, url]
-            if path is not None:
-                sinks.append(files.enter_context(open_sink(path))[0])
-        scans, unposed = scans_or_unposed(given, find=given.find)
-        timed = scans.times_s is not None or not unposed
-        check(timed, f"{given.scans}: scans without poses need times, one per scan")
-        if trajectory is not None:
-            check_pose_times(trajectory, scans.times_s)
+        sinks, urls = _opened_sinks(given, servers, files)
         begin = given.map
         changed = begin and (given.config or given.set or given.paper)
         refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
+        scans: Scans | Subscription
+        if request is not None:
+            stopped = servers.enter_context(deferred_interrupts())
+            node = servers.enter_context(contextlib.closing(Node(given.ros2_domain, given.host)))
+            scans = Subscription(node, given.ros2, request, given.find, stopped, warn)
+            sinks, unposed = [*sinks, Ros2Sink(node, scans)], scans.unposed
+            results.add(f"{', '.join(given.ros2)} mapped, the map published as /radarsdf/…; Ctrl-C ends it")
+        else:
+            scans, unposed = scans_or_unposed(given, find=given.find)
+            timed = scans.times_s is not None or not unposed
+            check(timed, f"{given.scans}: scans without poses need times, one per scan")
+            if trajectory is not None:
+                check_pose_times(trajectory, scans.times_s)
         growing = (
             LiveMap.load(begin) if begin else LiveMap(load_config(given), T_body_sensor=scans.T_body_sensor)
         )
         if urls:
             results.add(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
-        shown = _Shown(growing, scans, sinks) if sinks else None
+        shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
         done = replay(growing, scans, with_poses=not unposed, rate=given.rate, on_scan=shown)
-        _add_rates(results, done, len(scans))
+        _add_rates(results, done)
         if out is not None:
             made = growing.map() if given.quick else growing.finish(progress=results.progress)
             made.save(out)
             results.add(f"map {out}", out=out)
         if trajectory is not None:
-            times_s = None if scans.times_s is None else scans.times_s[done.rows]
+            times_s = np.array(done.times_s)[done.rows] if done.timed else None
             write_poses(trajectory, np.stack(done.poses), times_s)
             results.add(f"trajectory {trajectory}", trajectory=trajectory)
         if shown is not None:
-            shown.show(done.poses, float(done.times_s[done.rows[-1]]), final=True)
+            shown.show(done.poses, done.times_s[done.rows[-1]], final=True)
         files.close()
-        if urls:
+        if urls and request is None:
             results.end()
             until_stopped(wait)
+
+
+def _opened_sinks(
+    given: Namespace, servers: contextlib.ExitStack, files: contextlib.ExitStack
+) -> tuple[list[Sink], list[str]]:
+    """Sinks of the options, and the addresses of those that serve."""
+    sinks: list[Sink] = []
+    urls: list[str] = []
+    if given.view:
+        page = servers.enter_context(GrowingView(host=given.host, port=given.port))
+        sinks, urls = [page], [url_of(page.host, page.port)]
+    of_viewers = (foxglove_sink, given.foxglove, given.mcap), (rerun_sink, given.rerun, given.rrd)
+    for open_sink, served, path in of_viewers:
+        if served:
+            sink, url = servers.enter_context(open_sink(None))
+            sinks, urls = [*sinks, sink], [*urls, url]
+        if path is not None:
+            sinks.append(files.enter_context(open_sink(path))[0])
+    return sinks, urls
 
 
 class _Shown:
     """Callback after each scan that passes it to all sinks, and periodically the surface and free space, in its own thread."""
 
-    def __init__(self, live_map: LiveMap, scans: Scans, sinks: list[Sink]) -> None:
-        self._map, self._scans, self._sinks = live_map, scans, sinks
+    def __init__(
+        self, live_map: LiveMap, T_body_sensor: Mapping[Label, Floats] | None, sinks: list[Sink]
+    ) -> None:
+        self._map, self._mountings, self._sinks = live_map, T_body_sensor, sinks
         self._thread, self._lock = threading.Thread(), threading.Lock()
         self._next_s, self._next_grid_s = 0.0, 0.0
 
-    def __call__(self, done: Replay) -> None:
-        i, pose, scans = done.rows[-1], done.poses[-1], self._scans
-        label = None if scans.sensors is None else scans.sensors[i]
-        T = pose if scans.T_body_sensor is None else pose @ scans.T_body_sensor[label]
-        intensities = None if scans.intensities is None else scans.intensities[i]
-        scan, time_s = Scan(scans.points[i], T, intensities, sensor=label), float(done.times_s[i])
+    def __call__(self, done: Replay, scan: Scan) -> None:
+        pose, time_s = done.poses[-1], done.times_s[done.rows[-1]]
+        T = pose if self._mountings is None else pose @ self._mountings[scan.sensor]
+        scan = replace(scan, T_world_sensor=T)
         for sink in self._sinks:
             sink.show_scan(scan, time_s)
         if not self._thread.is_alive() and time.monotonic() > self._next_s:
@@ -180,9 +229,10 @@ class _Shown:
                 self._next_grid_s = time.monotonic() + (time.monotonic() - began_s) / _GRID_SHARE
 
 
-def _add_rates(results: Results, done: Replay, scans: int) -> None:
-    check(done.rows, "no scan was integrated into the map")
+def _add_rates(results: Results, done: Replay) -> None:
+    check(done.rows, "; ".join(["no scan was integrated into the map", *done.notes]))
     in_map, dropped, lost = len(done.rows), len(done.dropped), len(done.lost)
+    scans = in_map + dropped + lost
     line = f"{in_map} of {scans} scans in the map, {dropped} dropped, {lost} lost"
     results.add("\n".join([line, *done.notes]), scans=in_map, dropped=dropped, lost=lost, notes=done.notes)
     hertz = in_map / max(sum(done.seconds), 1e-9)

@@ -50,7 +50,7 @@ OF_COMMANDS = {
     "calibrate": "-o results reading settings",
     "locate": "map -o --guess results reading",
     "join": "sessions -o results settings",
-    "live": "-o --in --trajectory --rate --find --view --foxglove --mcap --rerun --rrd results reading page settings",
+    "live": "-o --ros2 --ros2-odom --ros2-domain --in --trajectory --rate --find --view --foxglove --mcap --rerun --rrd results reading page settings",
     "view": "map --locate --open --box --quiet reading page surface",
     "report": "map -o --locate --holdout --box results reading surface",
     "eval": "what --samples --holdout --box results reading surface",
@@ -103,6 +103,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "folder": (_PATH, "the folder written by radarsdf tiles plan"),
 
     "scans": (_PATH, "the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"),
+    "live scans": (_MAYBE, "the scans, as for radarsdf fit; or --ros2"),
     "view scans": (_MAYBE, "scans to browse, as for radarsdf fit"),
     "report scans": (_MAYBE, "the scans of the map, as for radarsdf fit"),
     "eval scans": (_PATH | {"metavar": "truth"}, ("the ground truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
@@ -180,6 +181,9 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "--find": (_FLAG, "ignore the poses of the scans: estimate them from returns and Doppler"),
     "--trajectory": (_FILE, "also write the trajectory of the scans: .tum, .kitti or .npy"),
     "--in": (_FILE | {"dest": "map"}, "continue this map of LiveMap.save, in which scans without poses are searched"),
+    "--ros2": (_NAMES | {"metavar": "TOPIC"}, "map this topic of running ROS 2 nodes until Ctrl-C, and publish the map as /radarsdf/...; may be repeated"),
+    "--ros2-odom": (_NAME | {"metavar": "TOPIC"}, "with --ros2: the topic of the poses; default: TF, else they are estimated"),
+    "--ros2-domain": (_COUNT | {"default": 0}, "with --ros2: the DDS domain, ROS_DOMAIN_ID of the nodes, at the interface of --host; default: 0"),
     "--rate": ({"type": float, "default": 1.0},
                "factor on the recorded speed, or on 0.1 s per scan without times; 0: as fast as possible"),
     "--open": (_SWITCH, "open the page in a local browser; default: if there is a display"),
@@ -219,7 +223,7 @@ COMMANDS = {
         "calibrate": ("SCANS [POSES] [-o MOUNTINGS]", "Estimate how several radars are mounted, and their time offsets."),
         "locate": ("MAP SCANS -o POSES", "Find the poses of scans in a map that was made before."),
         "join": ("SCANS SCANS... -o FOLDER", "Place several sessions at one place in one frame."),
-        "live": ("SCANS [POSES]", "Replay a recording into a growing map, and report whether it keeps up."),
+        "live": ("[SCANS [POSES]]", "Replay a recording into a growing map, or map running ROS 2 topics."),
         "tiles": ("SCANS [POSES] -o FOLDER", "Fit a map larger than memory in tiles, locally or on a cluster."),
     },
     "Uses of a map": {
