@@ -33,7 +33,7 @@ FAST = [
     "--quiet",
     "--json",
 ]
-TIMEOUT_S = 60
+TIMEOUT_S = 180
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def received(node, readers):
     for topic, kinds in node.published().items():
         if topic not in readers and topic.startswith(("/radarsdf", "/tf")):
             latched = topic in ("/radarsdf/surface", "/radarsdf/grid")
-            readers[topic] = node.reader(topic, *kinds, latched=latched), *kinds
+            readers[topic] = node.reader(topic, *kinds, reliable=True, latched=latched), *kinds
     for topic, (reader, kind) in readers.items():
         for sample in reader.take(100):
             if sample.sample_info.valid_data:

@@ -64,22 +64,25 @@ class Node:
     def close(self) -> None:
         self._domain._delete(self._domain._ref)
 
-    def published(self) -> dict[str, set[str]]:
-        """Types of messages by topic."""
-        topics: dict[str, set[str]] = {}
+    def published(self) -> dict[str, dict[str, bool]]:
+        """By topic, the types of messages, and whether all who publish them are reliable."""
+        from cyclonedds.qos import Policy  # noqa: PLC0415 - an extra
+
+        topics: dict[str, dict[str, bool]] = {}
         for endpoint in self._found.read(10_000):
-            package, _, name = (endpoint.type_name or "").partition(
-                "::msg::dds_::"
-            )  # none of those that left
+            # Those that left have no name.
+            package, _, name = (endpoint.type_name or "").partition("::msg::dds_::")
             if name and endpoint.topic_name.startswith("rt/"):
-                topics.setdefault(endpoint.topic_name[2:], set()).add(f"{package}/msg/{name[:-1]}")
+                types = topics.setdefault(endpoint.topic_name[2:], {})
+                kind, policy = f"{package}/msg/{name[:-1]}", endpoint.qos[Policy.Reliability]
+                types[kind] = types.get(kind, True) and isinstance(policy, Policy.Reliability.Reliable)
         return topics
 
-    def reader(self, topic: str, message_type: str, *, latched: bool = False) -> Any:
-        """Return a reader that matches reliable and best-effort publishers; `latched`: those that keep their last message."""
+    def reader(self, topic: str, message_type: str, *, reliable: bool, latched: bool = False) -> Any:
+        """Return a reader, `reliable` if all publishers are: else it matches none of the others. `latched`: they keep their last message."""
         from cyclonedds.sub import DataReader  # noqa: PLC0415 - an extra
 
-        qos = _qos(_QUEUED, reliable=latched, latched=latched)
+        qos = _qos(_QUEUED, reliable=reliable, latched=latched)
         return DataReader(self._participant, self._topic(topic, message_type), qos=qos)
 
     def publish(self, topic: str, message: Any, *, encoded: bytes = b"", latched: bool = False) -> None:
@@ -350,10 +353,12 @@ class Subscription:
             wanted[self._request.pose_topic] = bag_messages.POSE_TYPES
         found = self._node.published()
         for topic in (wanted.keys() & found.keys()) - self._readers.keys():
-            fitting = sorted(found[topic] & set(wanted[topic]))
+            fitting = sorted(found[topic].keys() & set(wanted[topic]))
             listed = ", ".join(sorted(found[topic]))
             check(fitting, f"{topic} has messages {listed}; it must have one of {', '.join(wanted[topic])}")
-            self._readers[topic] = fitting[0], self._node.reader(topic, fitting[0], latched=topic == _STATIC)
+            kind = fitting[0]
+            reader = self._node.reader(topic, kind, reliable=found[topic][kind], latched=topic == _STATIC)
+            self._readers[topic] = kind, reader
 
     def _receive(self, topic: str, message_type: str, sample: Any) -> None:
         recorded_s = 1e-9 * sample.sample_info.source_timestamp
