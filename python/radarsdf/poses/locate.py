@@ -208,19 +208,21 @@ class _Localiser:
         if len(rows) < 2:
             information = anchor(poses)[0] + WEAK * np.eye(6)
             covariance = np.linalg.inv(information).astype(np.float64)
-            return rows, poses, covariance, anchor.explained(poses)
-        placed = [
-            dataclasses.replace(self.tracked[i], pose=pose) for i, pose in zip(rows, poses, strict=True)
-        ]
-        whole = [*self.tracked[: rows[0]], *placed, *self.tracked[rows[-1] + 1 :]]
-        motions = self.drive.motions(whole, slice(rows[0], rows[-1] + 1))
-        returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
-        cell_m = plane_cell_m(scans, self.config.leaf_size_m)
-        found = PosesEstimate.of(
-            returns, poses, motions, cell_m, limits, self.num_threads, len(rows), False, anchor
-        )
-        covariance = found.covariance + (_as_guessed(found.poses) if undecided else 0)
-        return rows, found.poses, covariance, anchor.explained(found.poses)
+        else:
+            placed = [
+                dataclasses.replace(self.tracked[i], pose=pose) for i, pose in zip(rows, poses, strict=True)
+            ]
+            whole = [*self.tracked[: rows[0]], *placed, *self.tracked[rows[-1] + 1 :]]
+            motions = self.drive.motions(whole, slice(rows[0], rows[-1] + 1))
+            returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
+            cell_m = plane_cell_m(scans, self.config.leaf_size_m)
+            found = PosesEstimate.of(
+                returns, poses, motions, cell_m, limits, self.num_threads, len(rows), False, anchor
+            )
+            poses, covariance = found.poses, found.covariance
+        if undecided:
+            covariance = covariance + _as_guessed(poses)
+        return rows, poses, covariance, anchor.explained(poses)
 
     def _place(
         self, returns: SensorReturns, poses: Floats, guess: Floats | None
