@@ -16,7 +16,6 @@ from radarsdf.poses.search import Lost, OrientedPoints, SurfaceIndex, search
 from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
-from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.threads import resolve_num_threads
 
 # Prior standard deviations of the offset between the frames of two maps: translation, m, and rotation vector, rad.
@@ -75,9 +74,10 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         found = searched
     place = _place(before, after)
     if place is not None:
-        searched = _constrained_pose(before, surface.placed(place), np.eye(4))
+        near = surface.placed(place)
+        searched = _constrained_pose(before, near, np.eye(4))
         if nearer(found[0], searched[0] @ place):
-            found, own, T_near = searched, surface.placed(place), place
+            found, own, T_near = searched, near, place
     pose, covariance, undetermined = found
     offset, pose = own.offset(pose), pose @ T_near
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
@@ -145,10 +145,7 @@ def _place(before: PlacedMap, after: PlacedMap) -> Floats | None:
         OrientedPoints(placed.vertices, placed.normals, float(np.nanmedian(placed.sigma_m)))
         for placed in (before, after)
     )
-    origin = earlier.centre
-    index = SurfaceIndex(
-        replace(earlier, points=earlier.points - origin), LEAVES_PER_SURFEL * before.leaf_m, origin
-    )
+    index = SurfaceIndex.of_surface(earlier, earlier.centre, before.leaf_m)
     try:
         return search(index, later, resolve_num_threads(before.radar_map.config.num_threads))
     except Lost:

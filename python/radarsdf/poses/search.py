@@ -127,7 +127,11 @@ class SurfaceIndex:
     ) -> SurfaceIndex:
         """Build from the surfels of scans at poses (F, 4, 4)."""
         surface = OrientedPoints.of_returns(returns, poses, leaf_m, num_threads)
-        origin = poses[:, :3, 3].mean(axis=0)
+        return cls.of_surface(surface, poses[:, :3, 3].mean(axis=0), leaf_m)
+
+    @classmethod
+    def of_surface(cls, surface: OrientedPoints, origin: Floats, leaf_m: float) -> SurfaceIndex:
+        """Build from a surface in the world of the map, in leaf cells of `leaf_m`."""
         local = dataclasses.replace(surface, points=surface.points - origin)
         return cls(local, LEAVES_PER_SURFEL * leaf_m, origin)
 
@@ -295,7 +299,10 @@ def search_scans(
     Return the transform (4, 4) from the world of the drive to that of the map, and the scans of the part.
     """
     why = Lost("there are no returns")
-    for part, submap in _submaps(index, returns, poses, num_threads):
+    for part in _parts(len(poses)):
+        submap = _submap(index, returns, poses, part, num_threads)
+        if submap is None:
+            continue
         try:
             return search(index, submap, num_threads), part
         except Lost as lost:
@@ -303,18 +310,24 @@ def search_scans(
     raise why
 
 
-def _submaps(
-    index: SurfaceIndex, returns: SensorReturns, poses: Floats, num_threads: int
-) -> Iterator[tuple[slice, OrientedPoints]]:
-    length = SUBMAP_SCANS // 2
-    while len(returns) and (length < len(poses) or length < SUBMAP_SCANS):
+def _parts(count: int) -> Iterator[slice]:
+    """Yield the parts of a drive of `count` scans, ever longer ones."""
+    length = SUBMAP_SCANS
+    while True:
+        for first in range(0, max(count - length // 2, 1), length):
+            yield slice(first, min(first + length, count))
+        if length >= count:
+            return
         length *= 2
-        for first in range(0, max(len(poses) - length // 2, 1), length):
-            part = slice(first, min(first + length, len(poses)))
-            inside = returns.select((returns.scans >= part.start) & (returns.scans < part.stop))
-            if len(inside):
-                leaf_m = index.cell_m / LEAVES_PER_SURFEL
-                yield part, OrientedPoints.of_returns(inside, poses, leaf_m, num_threads)
+
+
+def _submap(
+    index: SurfaceIndex, returns: SensorReturns, poses: Floats, part: slice, num_threads: int
+) -> OrientedPoints | None:
+    inside = returns.select((returns.scans >= part.start) & (returns.scans < part.stop))
+    if len(inside) == 0:
+        return None
+    return OrientedPoints.of_returns(inside, poses, index.cell_m / LEAVES_PER_SURFEL, num_threads)
 
 
 def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Floats:
@@ -353,9 +366,13 @@ def search_near(
     Lost if the drive clearly agrees better elsewhere.
     """
     note = "The returns do not confirm the guess: the scans or the map show no steep surface."
-    for part, submap in _submaps(index, returns, poses, num_threads):
+    for part in _parts(len(poses)):
+        # The guess is that of the first scan, from which poses drift.
+        submap = None if part.start else _submap(index, returns, poses, part, num_threads)
+        if submap is None:
+            continue
         starts = index.candidates(submap, num_threads)
-        if part.start or len(starts) == 0:
+        if len(starts) == 0:
             continue
         found = _Places.of(index, submap, starts, guess)
         k = int(np.argmax(found.agreeing))
@@ -441,12 +458,12 @@ class _Places:
 
     def rival(self, place: int) -> int | None:
         """Return another place with which the submap does not clearly agree less."""
-        return next((k for k in self.elsewhere(place) if not self.evidence(place, k).decides), None)
-
-    def evidence(self, place: int, other: int) -> _Evidence:
         others = self.elsewhere(place)
         chance = float(np.median(self.agreeing[others])) if len(others) else 0.0
-        return _Evidence.of(self.scores[place], self.scores[other], chance, self.blocks)
+        clear = (
+            _Evidence.of(self.scores[place], self.scores[k], chance, self.blocks).decides for k in others
+        )
+        return next((k for k, decided in zip(others.tolist(), clear, strict=True) if not decided), None)
 
 
 def _shifted(poses: Floats, shift: Floats) -> Floats:
