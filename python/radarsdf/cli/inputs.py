@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from argparse import Namespace
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -75,9 +76,8 @@ def request_of_topics(given: Namespace) -> Request | None:
     )
     if given.scans:
         return None
-    for option in ("--topic", "--pose-topic", "--imu-topic", "--imu-rotation", "--columns"):
-        value = vars(given)[option.lstrip("-").replace("-", "_")]
-        refuse_if(value is not None, f"--ros2 reads no file: {option} {value} would have no effect")
+    of_files = "--topic", "--pose-topic", "--imu-topic", "--imu-rotation", "--columns"
+    _refuse_useless(given, of_files, "--ros2 reads no file")
     refuse_if(given.rate != 1, f"--ros2 maps scans as they come: --rate {given.rate} would have no effect")
     wrong = [topic for topic in (*given.ros2, given.ros2_odom or "/") if not topic.startswith("/")]
     refuse_if(wrong, f"the name of a topic begins with /, unlike {wrong}")
@@ -103,10 +103,16 @@ def scans_or_unposed(given: Namespace, *, find: bool = False) -> tuple[Scans, bo
 
 def scans_if(wanted: object, given: Namespace) -> Scans | None:
     """Read the scans, or refuse the options for reading them if none are `wanted`."""
-    for option in () if wanted else GROUPS["reading"].split()[1:]:
+    if wanted:
+        return read_scans(given)
+    _refuse_useless(given, GROUPS["reading"].split()[1:], "no scans are read")
+    return None
+
+
+def _refuse_useless(given: Namespace, options: Iterable[str], why: str) -> None:
+    for option in options:
         value = vars(given)[option.lstrip("-").replace("-", "_")]
-        refuse_if(value not in (None, MAX_GAP_S), f"no scans are read: {option} {value} would have no effect")
-    return read_scans(given) if wanted else None
+        refuse_if(value not in (None, MAX_GAP_S), f"{why}: {option} {value} would have no effect")
 
 
 def without_intensities(scans: Scans) -> Scans:
