@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Array, Floats, Ints
-from radarsdf.poses.rigid import between, turned_by
+from radarsdf.poses.rigid import assembled, between, turned_by
 
 _NEIGHBOURS = 4  # nearest returns of the same scan whose mean distance is the spacing at a return
 MIN_RETURNS = _NEIGHBOURS + 2  # scans with fewer are not compared
@@ -154,14 +154,10 @@ def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) ->
     poses, motions = T_world_sensor, relative(T_world_sensor, pairs)
 
     def positions(values: Floats) -> Floats:
-        changed = poses.copy()
-        changed[:, :3, 3] = values
-        return relative(changed, pairs)
+        return relative(assembled(poses[:, :3, :3], values), pairs)
 
     def rotations(values: Rotation) -> Floats:
-        changed = poses.copy()
-        changed[:, :3, :3] = values.as_matrix()
-        return relative(changed, pairs)
+        return relative(assembled(values.as_matrix(), poses[:, :3, 3]), pairs)
 
     still = np.tile(np.eye(4), (len(pairs), 1, 1))
     found = [
@@ -180,7 +176,7 @@ def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) ->
         # z up or down, x and y in any order; and the camera frame
         if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
             continue
-        turned = _transform(matrix)
+        turned = assembled(matrix)
         up = float(matrix[2, 0]), float(matrix[2, 1]), float(matrix[2, 2])
         what = f"the points are read as ({words})"
         found.append(Hypothesis(kind, what, turned.T @ motions @ turned, up))
@@ -199,20 +195,13 @@ def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) ->
         found.append(Hypothesis("quaternion_order", what, rotations(rolled)))
     for name, (axis, turns) in _TURNS_DEG.items():
         for degrees in (sign * turn for turn in turns for sign in (1, -1)):
-            T_vehicle_sensor = _transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+            T_vehicle_sensor = assembled(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
             what = f"the sensor is rotated by {degrees} degrees in {name} against the frame of the poses"
             moved = T_vehicle_sensor.T @ motions @ T_vehicle_sensor
             found.append(Hypothesis("sensor_turned", what, moved))
     found.append(
         Hypothesis("scans_exchanged", "the order of the scans is reversed", relative(poses[::-1], pairs))
     )
-    return found
-
-
-def _transform(matrix: Floats) -> Floats:
-    """Embed a matrix (3, 3) as a transform (4, 4)."""
-    found = np.eye(4)
-    found[:3, :3] = matrix
     return found
 
 

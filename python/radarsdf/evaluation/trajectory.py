@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check, check_poses, real_array
-from radarsdf.poses.rigid import aligned, between, nearest_rotation, placed, steps, turned_by
+from radarsdf.poses.rigid import aligned, assembled, between, nearest_rotation, placed, steps, turned_by
 
 Alignment = Literal["positions", "poses", "none"]
 
@@ -88,8 +88,7 @@ def trajectory_metrics(
 
 def _with_positions(poses: Floats, true: Floats) -> Floats:
     from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
-    whole = np.eye(4)
-    whole[:3, :3] = nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle))
+    whole = assembled(nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle)))
     return np.einsum("ij,fjk->fik", placed(whole, poses, true), poses)
 
 

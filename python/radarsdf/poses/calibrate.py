@@ -19,7 +19,7 @@ from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.mountings import PRIOR, BodyPath, RadarsOfBody, estimate_mountings
 from radarsdf.poses.odometry import odometry
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.rigid import increments, moved, skew, step_vectors
+from radarsdf.poses.rigid import assembled, increments, moved, skew, step_vectors
 from radarsdf.rig import Label, Rig
 from radarsdf.scans import Scans, chosen
 
@@ -237,8 +237,7 @@ def _imu_mounting(
     inertial = Inertial.of(imu, velocities, times_s - times_s[0], float(times_s[0]))
     if (found := inertial.alignment) is None:
         return None, inertial.notes
-    T = np.eye(4)
-    T[:3, :3] = T_body_sensor[:3, :3] @ found.R_sensor_imu
+    T = assembled(T_body_sensor[:3, :3] @ found.R_sensor_imu)
     lever_m = T[:3, :3] @ found.lever_m
     T[:3, 3] = T_body_sensor[:3, 3] - lever_m
     J = np.eye(7)

@@ -26,7 +26,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.motion import Motion
 from radarsdf.poses.planes import SensorReturns, planes_of, unbiased_normals
-from radarsdf.poses.rigid import increments, moved, rotation, skew
+from radarsdf.poses.rigid import assembled, increments, moved, rotation, skew
 from radarsdf.returns.noise import rig_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.threads import resolve_num_threads
@@ -151,8 +151,7 @@ def _sensor_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Floats, 
     at = path.motion(radars.times_s - path.late_s[radars.of_scan])
     M = path.mountings[radars.of_scan]
     lever, arm = M[:, :3, 3], np.einsum("fij,fj->fi", at.R, M[:, :3, 3])
-    poses = np.tile(np.eye(4), (len(M), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = at.R @ M[:, :3, :3], at.p + arm
+    poses = assembled(at.R @ M[:, :3, :3], at.p + arm)
     in_body = np.einsum("fji,fj->fi", at.R, at.v) + np.cross(at.omega, lever)
     velocities = np.einsum("fji,fj->fi", M[:, :3, :3], in_body)
     speeds = np.linalg.norm(velocities, axis=1)
@@ -181,8 +180,7 @@ def _smooth_rows(path: BodyPath) -> tuple[Any, Floats]:
 def _step_rows(path: BodyPath, steps: Motion, times_s: Floats) -> tuple[Any, Floats]:
     """Derivatives and residuals (F - 1, 6) of the steps of the body at `times_s` (F,) against given ones, normalised."""
     at = path.motion(times_s)
-    poses = np.tile(np.eye(4), (len(at.p), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = at.R, at.p
+    poses = assembled(at.R, at.p)
     spread = np.sqrt(np.repeat(steps.variances, 3) * steps.shares)
     columns = path.columns(at, np.tile(np.eye(6, 12), (len(at.p), 1, 1)))
     before, after = (_block_diagonal(jacobian / spread[:, :, None]) for jacobian in steps.jacobians(poses))

@@ -35,11 +35,9 @@ def step_vectors(poses: Floats) -> Floats:
 
 def between(first: Floats, second: Floats) -> Floats:
     """Return the motions (K, 4, 4) from `first` to `second` poses, in the frames of the first."""
-    found = np.tile(np.eye(4), (len(first), 1, 1))
     back = first[:, :3, :3]
-    found[:, :3, :3] = np.einsum("fji,fjk->fik", back, second[:, :3, :3])
-    found[:, :3, 3] = np.einsum("fji,fj->fi", back, second[:, :3, 3] - first[:, :3, 3])
-    return found
+    turns = np.einsum("fji,fjk->fik", back, second[:, :3, :3])
+    return assembled(turns, np.einsum("fji,fj->fi", back, second[:, :3, 3] - first[:, :3, 3]))
 
 
 def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
@@ -53,8 +51,7 @@ def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
 def aligned(poses: Floats, reference: Floats) -> Floats:
     """Rigidly align poses (F, 4, 4) with the mean position and mean rotation of `reference`."""
     turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
-    whole = np.eye(4)
-    whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
+    whole = assembled(Rotation.from_matrix(turns).mean().as_matrix())
     return np.einsum("ij,fjk->fik", placed(whole, poses, reference), poses)
 
 
@@ -99,8 +96,13 @@ def rotation(vector: Floats) -> Floats:
 
 def transform(turn: Floats, translation: Floats) -> Floats:
     """Build transforms (..., 4, 4) from rotation vectors (..., 3), rad, and translations (..., 3), m."""
-    found = np.zeros((*turn.shape[:-1], 4, 4))
-    found[..., :3, :3] = rotation(turn)
+    return assembled(rotation(turn), translation)
+
+
+def assembled(matrix: Floats, translation: Floats | float = 0.0) -> Floats:
+    """Build transforms (..., 4, 4) from matrices (..., 3, 3) and translations (..., 3), m."""
+    found = np.zeros((*matrix.shape[:-2], 4, 4))
+    found[..., :3, :3] = matrix
     found[..., :3, 3] = translation
     found[..., 3, 3] = 1
     return found
