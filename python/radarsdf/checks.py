@@ -96,11 +96,16 @@ def check_scan_shape(scan: Array, number: int) -> None:
     check(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
-def check_values_of_scans(values: Sequence[Array], scans: Sequence[Array], name: str) -> None:
-    """Refuse values that are not one array (N,) for each scan (N, 3)."""
+def values_of_scans(
+    given: Iterable[Any], scans: Sequence[Array], name: str, convert: Callable[[Any, str], Array] = real_array
+) -> list[Array]:
+    """Convert to one array (N,) for each scan (N, 3). Raise a TypeError or a ValueError if they do not match."""
+    each = enumerate(one_for_each_scan(given, name))
+    values = [convert(value, f"{name} of scan {i}") for i, value in each]
     check(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
         check_values_of_scan(value, scan, name, i)
+    return values
 
 
 def check_values_of_scan(value: Array, scan: Array, name: str, number: int) -> None:

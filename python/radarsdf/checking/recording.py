@@ -120,8 +120,10 @@ def checked_input(
         one_each = times.shape == (len(scans),)
         checks.check(one_each, f"times_s must have shape ({len(scans)},), not {times.shape}")
         times[np.abs(times) > checks.MAX_TIME_S] = np.nan
-    doppler = _values(doppler_mps, scans, "doppler_mps")
-    values = _values(intensities, scans, "intensities")
+    doppler, values = (
+        None if given is None else checks.values_of_scans(given, scans, name, _numbers)
+        for name, given in (("doppler_mps", doppler_mps), ("intensities", intensities))
+    )
     return Scans(scans, T_world_sensor, values, doppler_mps=doppler, times_s=times)
 
 
@@ -147,12 +149,3 @@ def _numbers(values: ArrayLike, name: str) -> Array:
         checks.refuse_masked(values, name)
         return values
     return checks.real_array(values, name)
-
-
-def _values(given: Sequence[ArrayLike] | None, scans: list[Array], name: str) -> list[Array] | None:
-    if given is None:
-        return None
-    each = enumerate(checks.one_for_each_scan(given, name))
-    values = [_numbers(value, f"{name} of scan {i}") for i, value in each]
-    checks.check_values_of_scans(values, scans, name)
-    return values

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Floats, Ints
-from radarsdf.checks import MAX_TIME_S, check, real_array
+from radarsdf.checks import MAX_TIME_S, check, real_array, values_of_scans
 from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities, radial_offset_mps
-from radarsdf.returns.moving import checked_doppler, without_filler
+from radarsdf.returns.moving import without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Rig
 from radarsdf.scans import Scans, chosen, filled
@@ -57,7 +57,7 @@ class CheckedScans:
                 notes = [*notes, f"{repeated} scans repeat the previous time: they are spread evenly."]
         if doppler_mps is None or times_s is None:
             return cls(scans, times_s, begin_s, None, 0, notes)
-        speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
+        speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
         notes = notes if filler is None else [*notes, f"{filler}."]
         try:
             velocities = SensorVelocities.of(scans, speeds, times_s)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Array, Bools, Floats
-from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
+from radarsdf.checks import one_for_each_scan, values_of_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.products import normal_matrix, product
@@ -179,7 +179,7 @@ class MovingReturns:
     def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> MovingReturns:
         """Build from scans (N_i, 3), sensor frame, m, and Doppler (N_i,), m/s, either sign, NaN where missing."""
         scans, _, _ = check_scans(points)
-        speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
+        speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
         none = [np.zeros(len(scan), bool) for scan in scans]
         tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_DOPPLER_RETURNS]
         found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
@@ -245,14 +245,6 @@ class StaticReturns:
         moving = MovingReturns.of_radars(points, doppler_mps, rig)
         values = None if intensities is None else moving.without(intensities)
         return cls(moving.without(points), values, moving.count, moving.why_none)
-
-
-def checked_doppler(scans: list[Array], doppler_mps: Sequence[ArrayLike]) -> list[Array]:
-    """Return F arrays (N_i,). Raise a TypeError or ValueError if they are not numbers or do not match the scans."""
-    each = enumerate(one_for_each_scan(doppler_mps, "doppler_mps"))
-    speeds = [real_array(values, f"doppler_mps of scan {i}") for i, values in each]
-    check_values_of_scans(speeds, scans, "doppler_mps")
-    return speeds
 
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:

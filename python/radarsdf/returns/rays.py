@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -184,9 +185,8 @@ def check_scans(
     checks.check_scan_shapes(scans)
     if intensities is None:
         return scans, None, left_out
-    each = enumerate(checks.one_for_each_scan(intensities, "intensities"))
-    values = [checks.real_array(of_scan, f"intensities of scan {i}", np.float32) for i, of_scan in each]
-    checks.check_values_of_scans(values, scans, "intensities")
+    in_float32 = functools.partial(checks.real_array, dtype=np.float32)
+    values = checks.values_of_scans(intensities, scans, "intensities", in_float32)
     return scans, [np.where(np.isfinite(v), v, np.float32(np.nan)) for v in values], left_out
 
 
