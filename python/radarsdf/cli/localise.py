@@ -9,13 +9,14 @@ import numpy as np
 import radarsdf
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
-from radarsdf.cli.inputs import inputs_of, load_map, read_scans
+from radarsdf.cli.inputs import load_map, read_scans
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, warn
+from radarsdf.cli.scans import check_poses_out, write_posed
 from radarsdf.cli.settings import load_config
-from radarsdf.io.files import check_outputs, checked_suffix
+from radarsdf.io.files import check_outputs
 from radarsdf.io.npz import write_scans
-from radarsdf.io.poses import POSE_SUFFIXES, UNPOSED, NoPoses, check_pose_times, write_poses
+from radarsdf.io.poses import UNPOSED, NoPoses, check_pose_times
 from radarsdf.io.read import read
 from radarsdf.map.map import Map
 from radarsdf.poses.rigid import transform
@@ -25,25 +26,16 @@ from radarsdf.scans import Scans
 def locate(given: Namespace, results: Results) -> None:
     """Localise the scans in the map, print what was found, and write the poses of the scans that were."""
     out = given.out
-    as_scans = out.suffix.lower() == ".npz"
-    if not as_scans:
-        checked_suffix(out, POSE_SUFFIXES, "poses to write")
-    check_outputs([out], inputs_of(given))
+    check_poses_out(given)
     guess = None
     if given.guess is not None:
         *position, yaw_deg = given.guess
         guess = transform(np.array([0.0, 0.0, np.radians(yaw_deg)]), np.array(position))
     scans = unposed_scans(given)
-    if not as_scans:
-        check_pose_times(out, scans.times_s)
+    check_pose_times(out, scans.times_s)
     placed = located(load_map(given.map), scans, results, guess)
-    if as_scans:
-        write_scans(out, placed)
-    else:
-        what = f"{len(scans) - len(placed)} scans are lost, but {out} cannot tell which: write .tum or .npz"
-        check(len(placed) == len(scans) or out.suffix.lower() == ".tum", what)
-        write_poses(out, placed.poses, placed.times_s)
-    results.add_file(f"{len(placed)} poses", out)
+    lost = len(scans) - len(placed)
+    write_posed(out, placed, results, f"{lost} scans are lost" if lost else "")
 
 
 def unposed_scans(given: Namespace) -> Scans:

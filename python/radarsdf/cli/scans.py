@@ -53,22 +53,12 @@ def poses(given: Namespace, results: Results) -> None:
     """Refine or estimate the poses of the scans, and write them."""
     out, picture = given.out, given.picture
     refuse_if(given.find and given.poses, f"--find does not use poses: leave out {given.poses}")
-
-    as_scans = out.suffix.lower() == ".npz"
-    if not as_scans:
-        checked_suffix(out, POSE_SUFFIXES, "poses to write")
-    check_outputs([out, picture], inputs_of(given))
+    check_poses_out(given, picture)
     if picture is not None:
         require("matplotlib", what="pictures need")
-    config, times_for = load_config(given), None if as_scans else out
-    scans, posed = posed_scans(given, config, results, refine=True, find=given.find, times_for=times_for)
-    if as_scans:
-        write_scans(out, scans)
-    else:
-        what = f"there are {posed.segments} segments, but {out} cannot tell which scans have poses: write .tum or .npz"
-        check_that(posed.segments <= 1 or out.suffix.lower() == ".tum", what)
-        write_poses(out, scans.poses, scans.times_s)
-    results.add_file(f"{len(scans.poses)} poses", out)
+    config = load_config(given)
+    scans, posed = posed_scans(given, config, results, refine=True, find=given.find, times_for=out)
+    write_posed(out, scans, results, f"there are {posed.segments} segments" if posed.segments > 1 else "")
     if picture is not None:
         given_poses = {} if posed.given is None else {"given": posed.given}
         drawn = given_poses | {"refined" if given_poses else "found": scans.poses}
@@ -76,6 +66,25 @@ def poses(given: Namespace, results: Results) -> None:
             drawn = {name: scans.rig.sensor_poses(poses) for name, poses in drawn.items()}
         save_trajectory_picture(picture, scans.points, drawn)
         results.add(f"picture written to {picture}", picture=picture)
+
+
+def check_poses_out(given: Namespace, *others: Path | None) -> None:
+    """Check, before anything is read, that :func:`write_posed` and the `others` can write."""
+    if given.out.suffix.lower() != ".npz":
+        checked_suffix(given.out, POSE_SUFFIXES, "poses to write")
+    check_outputs([given.out, *others], inputs_of(given))
+
+
+def write_posed(out: Path, scans: Scans, results: Results, incomplete: str) -> None:
+    """Write scans, or only their poses. `incomplete`: why some scans of the input are missing, or ``""``."""
+    suffix = out.suffix.lower()
+    if suffix == ".npz":
+        write_scans(out, scans)
+    else:
+        what = f"{incomplete}, but {out} cannot tell which scans have poses: write .tum or .npz"
+        check_that(not incomplete or suffix == ".tum", what)
+        write_poses(out, scans.poses, scans.times_s)
+    results.add_file(f"{len(scans)} poses", out)
 
 
 def posed_scans(
