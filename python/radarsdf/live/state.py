@@ -25,6 +25,7 @@ from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
+from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import ScanSums, lattice_of
 from radarsdf.rig import Label
@@ -216,13 +217,20 @@ class GrowingState:
     def fit_input(self) -> Callable[[], FitInput]:
         """Return a function for the input of a fit of all scans, with the incremental sums."""
         scans, sums, visibility, origin = self.scans(), self._all_sums(), self._visibility(), self.origin
+        sealed = bool(self.log.sealed)
 
         def read() -> FitInput:
             rays = _rays_of(scans, self.config, origin).without_outliers()
             poses = np.stack([scan.T_world_sensor for scan in scans])
             moving = sum(int((~scan.is_static).sum()) for scan in scans if scan.is_static is not None)
+            radars, rig = None, rig_of_scans(scans)
+            if rig is not None:
+                radars = Radars.of(rays, rig.labels, self.config, self._num_threads)
+                rays = radars.in_one_unit(rays)
+            # The sums do not weight returns by the noise of their radars, but have those of sealed scans.
+            used = sums if rig is None or sealed else None
             scale = IntensityScale.of(rays.intensities)
-            return FitInput(rays, scale, poses, moving, sums=sums, visibility=visibility)
+            return FitInput(rays, scale, poses, moving, sums=used, radars=radars, visibility=visibility)
 
         return read
 
