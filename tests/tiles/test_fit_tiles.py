@@ -15,6 +15,8 @@ from radarsdf.io.files import take_lock
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, map_path
 
+from scenes.rigs import drive_of_rig
+
 from .cluster import bits_of
 from .conftest import CONFIG, TILE_M
 
@@ -54,6 +56,22 @@ def test_one_tile_equals_one_fit(drive, tmp_path):
     assert len(error) > 20
     assert error.mean() < 0.004 * (scale[1] - scale[0])
     assert error.max() < 0.02 * (scale[1] - scale[0])
+
+
+def test_tiles_of_a_rig_have_the_noise_and_unit_of_each_radar(tmp_path):
+    simulation = radarsdf.simulate.wall(seed=5, frames=12)
+    rig, front = (drive_of_rig(simulation, *labels, seed=1).scans for labels in ((), (["front"],)))
+    city = tiles_of(rig, tmp_path / "city")
+    whole, alone = (radarsdf.fit(scans, config=CONFIG) for scans in (rig, front))
+    assert len(city.tiles) > 1
+    assert city.sensors.keys() == whole.sensors.keys()
+    for label, gain_db in {"front": 0.0, "rear": -6.0, "side": 4.0}.items():
+        sensor, expected = city.sensors[label], whole.sensors[label]
+        np.testing.assert_allclose(sensor.noise.deviations, expected.noise.deviations, rtol=0.2)
+        assert abs(sensor.unit[1] - gain_db) < 1.0
+    points = np.asarray(whole.mesh().vertices)
+    seen = [of.intensity(points, rig.poses[4, :3, 3]) for of in (city, alone)]
+    assert abs(np.nanmedian(seen[0] - seen[1])) < 1.0
 
 
 def test_trained_tiles(drive, tmp_path):

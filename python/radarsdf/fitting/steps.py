@@ -37,6 +37,7 @@ from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import ScanSums
 from radarsdf.returns.view_statistics import ViewStatistics
+from radarsdf.rig import Label
 from radarsdf.threads import ThreadPool
 
 _Stop = KeyboardInterrupt | Diverged | None
@@ -60,6 +61,7 @@ class FitInput:
     clutter_ratio: float | None = None  # share of the returns not on a thin surface
     returns_per_cell: float | None = None  # mean number of returns in the cells of surfels
     sensor: Sensor | None = None
+    sensors: dict[Label, Sensor] = dataclasses.field(default_factory=dict)  # radars of a rig; with `sensor`
     box_cells: Ints | None = None
     """(2, 3) box [lower, upper) of free-space crossings to store, leaf cells from the origin. None: no limit."""
     sums: ScanSums | None = None  # sums over the scans of the rays, if updated incrementally
@@ -194,11 +196,13 @@ def _contents(
 ) -> dict[str, Any]:
     """Return the contents of the map by name, except for field, configuration and report."""
     rays, scale, surfels, leaf_m = given.rays, given.scale, surface.surfels, config.leaf_size_m
-    sensor, clutter_ratio, returns_per_cell = given.sensor, given.clutter_ratio, given.returns_per_cell
+    sensor, sensors = given.sensor, given.sensors
+    clutter_ratio, returns_per_cell = given.clutter_ratio, given.returns_per_cell
     if sensor is None:
         assert given.poses is not None
         sensor = Sensor.of_rays(rays, given.poses, surface.noise.mean)
-    noise, true, box_cells, radars = surface.noise, surface.true, given.box_cells, given.radars
+        sensors = {} if given.radars is None else given.radars.sensors(rays, given.poses)
+    noise, true, box_cells = surface.noise, surface.true, given.box_cells
 
     def free_space() -> FreeSpace:
         of_true = rays if true is None else rays.select(true)
@@ -223,7 +227,7 @@ def _contents(
         "clutter_ratio": surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
         "returns_per_cell": surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
         "sensor": sensor,
-        "sensors": {} if radars is None or given.poses is None else radars.sensors(rays, given.poses),
+        "sensors": sensors,
     }
 
 

@@ -171,8 +171,17 @@ def fit_tile(folder: str, name: str) -> None:
         rays, inside = read_rays(root, plan, tile)
         limits = plan.intensity_range
         scale = None if limits is None else IntensityScale.between(limits)
-        of_plan = {name: getattr(plan, name) for name in ("clutter_ratio", "returns_per_cell", "sensor")}
-        return FitInput(rays, scale, inside=inside, box_cells=plan.box_cells(tile.tile), **of_plan)
+        return FitInput(
+            rays,
+            scale,
+            inside=inside,
+            clutter_ratio=plan.clutter_ratio,
+            returns_per_cell=plan.returns_per_cell,
+            sensor=plan.sensor,
+            sensors=plan.sensors,
+            box_cells=plan.box_cells(tile.tile),
+            radars=plan.radars_of(rays),
+        )
 
     radar_map = fit_rays(read, plan.config, progress=False)
     radar_map.report["plan"] = plan.digest_of(tile)

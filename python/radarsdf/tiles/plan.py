@@ -23,11 +23,15 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.map.storage import checked_report
+from radarsdf.returns.noise import RigNoise
+from radarsdf.returns.radars import Radars
+from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
+from radarsdf.rig import Label
 from radarsdf.settings import by_name, settings
 
-FORMAT = {"format": "radarsdf.tiles", "format_version": 3}
+FORMAT = {"format": "radarsdf.tiles", "format_version": 4}
 PLAN, TILES = "plan.json", "tiles"
 
 Tile = tuple[int, int]
@@ -122,16 +126,25 @@ class TilePlan:
 
 
 @settings
+class RadarPlan:
+    """Radar of a rig."""
+
+    label: int | str | None  # None: it is the only one
+    sensor: Sensor  # with its noise, and its unit
+    intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, its own units
+
+
+@settings
 class Plan:
     """Settings common to all tasks, and the tiles. Its numbers name folders, so their types are checked."""
 
     config: FitConfig  # settings of all fits, with the sensor's noise and the number of threads
     tile_m: _Length
     halo_m: _Length
-    intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, sensor units
     clutter_ratio: Annotated[float, Field(ge=0, le=1)]  # clutter ratio of the largest tiles
     returns_per_cell: Annotated[float, Field(ge=0)]  # mean over the cells of surfels of the same tiles
     sensor: Sensor
+    radars: Annotated[tuple[RadarPlan, ...], Field(min_length=1)]
     scans: Annotated[_Count, Field(ge=1)]
     input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # hash of all scans
     tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]  # ascending: tiles that contain a return
@@ -159,6 +172,25 @@ class Plan:
         height = MAX_CELLS_FROM_ORIGIN
         return np.array([[*first, -height], [*(first + self.tile_cells), height]])
 
+    @property
+    def intensity_range(self) -> tuple[float, float] | None:
+        """Range of the intensities without outliers, in one unit. None: there are none."""
+        ends = [radar.intensity_range + radar.sensor.unit for radar in self.radars if radar.intensity_range]
+        scaled = [((low - offset) / gain, (high - offset) / gain) for low, high, gain, offset in ends]
+        return (min(low for low, _ in scaled), max(high for _, high in scaled)) if scaled else None
+
+    @property
+    def sensors(self) -> dict[Label, Sensor]:
+        """Radars of a rig by label; empty if there is one."""
+        return {radar.label: radar.sensor for radar in self.radars if radar.label is not None}
+
+    def radars_of(self, rays: Rays) -> Radars | None:
+        """Radars of the rays of a tile; None if there is one."""
+        if not self.sensors:
+            return None
+        noise = RigNoise.of([sensor.noise for sensor in self.sensors.values()], rays)
+        return Radars(tuple(self.sensors), noise, tuple(sensor.unit for sensor in self.sensors.values()))
+
     @cached_property
     def digest(self) -> str:
         """Hash of the whole plan, by which results of another plan are recognised."""
@@ -172,6 +204,7 @@ class Plan:
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         own |= {"config": self.config.to_dict(), "sensor": self.sensor.to_dict()}
         own["tiles"] = [dataclasses.asdict(planned) for planned in self.tiles]
+        own["radars"] = [vars(radar) | {"sensor": radar.sensor.to_dict()} for radar in self.radars]
         return json.dumps(FORMAT | own, indent=1).encode()
 
     def save(self, folder: Path) -> None:
@@ -197,10 +230,15 @@ class Plan:
                 config=FitConfig.from_dict(described.pop("config")),
                 sensor=Sensor.from_dict(described.pop("sensor")),
                 tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
+                radars=tuple(_radar_of(radar) for radar in described.pop("radars")),
                 **described,
             )
             check(plan._file_bytes() == content, "its checksum is wrong")
             return plan
+
+
+def _radar_of(described: dict[str, Any]) -> RadarPlan:
+    return RadarPlan(**described | {"sensor": Sensor.from_dict(described["sensor"])})
 
 
 def folder_of(folder: Path, tile: Tile) -> Path:

@@ -23,15 +23,16 @@ from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import StaticReturns
-from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
+from radarsdf.returns.radars import Unit, intensity_units
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label
 from radarsdf.scans import Scan, scans_in_memory
 from radarsdf.threads import ThreadPool
-from radarsdf.tiles.plan import Plan, Tile, TileGrid, TilePlan, folder_of
+from radarsdf.tiles.plan import Plan, RadarPlan, Tile, TileGrid, TilePlan, folder_of
 
 _LOG = logging.getLogger("radarsdf.tiles")
 SCANS_FILE = "scans.npy"
@@ -41,7 +42,8 @@ _CHUNK_SCANS = 256  # scans in memory at a time
 _CHUNK_RETURNS = 500_000  # returns in memory at a time: fewer scans of a dense sensor
 _CHUNK_M = 1000.0  # scans of a chunk share a local frame, in which float32 must be precise
 _SENSOR_SCANS = 512  # largest sample of scans for the sensor model
-_SAMPLED_TILES = 4  # tiles that estimate noise and clutter ratio
+_SAMPLED_TILES = 4  # tiles that estimate noise, units and clutter ratio
+_SAME: Unit = (1.0, 0.0)
 
 
 class ScanStream:
@@ -62,6 +64,7 @@ class ScanStream:
             check(shape == (4, 4), f"scan {i} has no pose: T_world_sensor must be (4, 4), not {shape}")
             for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
                 digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+            digest.update(repr(scan.sensor).encode())
             rigid.append(bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
             if rigid[-1]:
                 yield scan
@@ -98,16 +101,26 @@ def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
         yield chunk
 
 
+class _Returns:
+    """Returns of a radar, as far as its model needs them."""
+
+    def __init__(self) -> None:
+        self.samples: list[tuple[int, Scan]] = []  # scans with the smallest hashes
+        self.intensities = Intensities()
+
+    def add(self, scan: Scan) -> None:
+        self.samples.append((zlib.crc32(np.asarray(scan.points).tobytes()), scan))
+        self.samples = sorted(self.samples, key=itemgetter(0))[:_SENSOR_SCANS]
+
+
 class _Planner:
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
         self._folder, self._config, self._grid = folder, config, grid
         self._origins: dict[Tile, Ints] = {}  # (3,) origins of the tiles' maps, leaf cells
         self._counts: dict[Tile, Ints] = {}  # numbers of returns in each tile, and of rays
-        self._axes: list[Floats] = []  # (F, 6) sensor positions and z axes, world
-        self._samples: list[tuple[int, Scan]] = []  # scans with the smallest hashes
-        self._intensities = Intensities()
+        self._axes: list[Floats] = []  # (F, 7) sensor positions and z axes, world, and row of the radar
+        self._radars: dict[Label, _Returns] = {}
         self._with_intensities: bool | None = None
-        self._radar: Label | None = None
 
     def add(self, scans: list[Scan], first: int) -> None:
         for number, scan in enumerate(scans, first):
@@ -115,20 +128,22 @@ class _Planner:
             alike = self._with_intensities in (None, has)
             check(alike, f"all scans have intensities, or none: scan {number} is not like those before it")
             self._with_intensities = has
-            self._radar = scan.sensor if self._radar is None else self._radar
-            one = f"tiles are of one radar, not of {self._radar!r:.50} and {scan.sensor!r:.50}: fit them with radarsdf.fit"
-            check(scan.sensor == self._radar, one)
-            self._samples.append((zlib.crc32(np.asarray(scan.points).tobytes()), scan))
-            self._samples = sorted(self._samples, key=itemgetter(0))[:_SENSOR_SCANS]
         rays = self._rays(scans, first)
+        for i in np.unique(rays.scans).tolist():
+            self._radars.setdefault(scans[i].sensor, _Returns()).add(scans[i])
+        row = {label: i for i, label in enumerate(self._radars)}
+        radars = np.array([row.get(scan.sensor, 0) for scan in scans], np.int32)  # 0: it has no returns
         poses = np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans])
         together = self._config.returns.accumulate_scans
         seen_from = [middle_scan(i, len(scans), together) for i in range(len(scans))]
-        self._axes.append(np.concatenate([poses[seen_from, :3, 3], poses[:, :3, 2]], axis=1))
+        self._axes.append(np.concatenate([poses[seen_from, :3, 3], poses[:, :3, 2], radars[:, None]], axis=1))
         if len(rays) == 0:
             return
         if rays.intensities is not None:
-            self._intensities.add(rays.intensities, rays.hashes())
+            keys = rays.hashes()
+            for i, radar in enumerate(self._radars.values()):
+                heard = radars[rays.scans] == i
+                radar.intensities.add(rays.intensities[heard], keys[heard])
         points, sensors = rays.in_world()
         owner = self._grid.tiles_of(points)
         pairs = zip(*self._grid.crossed(points, sensors), strict=True)
@@ -155,7 +170,8 @@ class _Planner:
         try:
             given = held.points, held.intensities, held.doppler_mps
             static = StaticReturns.of(*given, config.returns, held.rig)
-            return prepare(static.points, held.poses, static.intensities, whole=False, **config.preparation)
+            options = {"rig": held.rig, "whole": False, **config.preparation}
+            return prepare(static.points, held.poses, static.intensities, **options)
         except (ValueError, TypeError) as error:
             msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
             raise ValueError(msg) from error
@@ -171,36 +187,51 @@ class _Planner:
         check(tiles, "no return of any scan lies within the ranges")
         axes = np.concatenate(self._axes)
         np.save(self._folder / SCANS_FILE, axes, allow_pickle=False)
+        radars = [
+            RadarPlan(
+                label=label if label is None or isinstance(label, (int, str)) else str(label),
+                sensor=self._sensor([(own, _SAME)]),
+                intensity_range=self._intensity_range(own, tiles, axes[:, 6] == i),
+            )
+            for i, (label, own) in enumerate(self._radars.items())
+        ]
         draft = Plan(
             config=self._config,
             tile_m=self._grid.tile_m,
             halo_m=self._grid.halo_m,
-            intensity_range=self._intensity_range(tiles),
             clutter_ratio=0.0,
             returns_per_cell=0.0,
-            sensor=self._sensor(SensorNoise(0.0, 0.0, 0.0)),
+            sensor=radars[0].sensor,
+            radars=tuple(radars),
             scans=len(axes),
             input_digest=input_digest,
             tiles=tuple(tiles),
         )
-        return self._completed(draft)
+        plan = self._completed(draft)
+        if self._with_intensities:
+            check_range(*(plan.intensity_range or (0.0, 0.0)))
+        return plan
 
-    def _intensity_range(self, tiles: list[TilePlan]) -> tuple[float, float] | None:
-        if not self._with_intensities:
-            return None
-        low, high, plausible = self._intensities.low, self._intensities.high, self._intensities.plausible()
+    def _intensity_range(
+        self, radar: _Returns, tiles: list[TilePlan], of_scans: Bools
+    ) -> tuple[float, float] | None:
+        """Range of the intensities of a radar, that of the scans in the mask `of_scans` (F,). None: it measures none."""
+        intensities = radar.intensities
+        low, high, plausible = intensities.low, intensities.high, intensities.plausible()
         if not plausible.holds(np.array([low, high])).all():
             low, high = math.inf, -math.inf
             for tile in tiles:
-                values = np.fromfile(rays_path(self._folder, tile.tile), _RECORD)["intensity"]
+                rows = np.fromfile(rays_path(self._folder, tile.tile), _RECORD)
+                values = rows["intensity"][of_scans[rows["scan"]]]
                 values = values[plausible.holds(values)]
                 low, high = float(values.min(initial=low)), float(values.max(initial=high))
-        check_range(low, high)
-        return low, high
+        return (low, high) if low <= high else None
 
     def _completed(self, plan: Plan) -> Plan:
-        """Complete the plan with the noise and clutter ratio of the largest tiles, and the cost of each."""
+        """Complete the plan with the noise, units and clutter ratio of the largest tiles, and the cost of each."""
         noises: list[SensorNoise] = []
+        of_radars: list[tuple[SensorNoise, ...]] = []
+        units: list[tuple[Unit | None, ...]] = []
         tiles, clutter, returns, cells, in_cells = [], 0.0, 0, 0, 0.0
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns):
             rays, inside = read_rays(self._folder, plan, tile)
@@ -211,7 +242,16 @@ class _Planner:
                 continue
             with ThreadPool(plan.config.num_threads) as workers:
                 surfels = Surfels.of(rays, plan.config.leaf_size_m, workers.num_threads)
-                noises.append(sensor_noise(surfels, rays, plan.config.returns, workers.num_threads))
+                of_rays = surfels, rays, plan.config.returns, workers.num_threads
+                if plan.sensors:
+                    rig = rig_noise(*of_rays)
+                    units.append(intensity_units(surfels, rays, workers.num_threads))
+                    of_radars.append(rig.of_sensors)
+                    noises.append(rig.mean)
+                else:
+                    units.append((_SAME,))
+                    noises.append(sensor_noise(*of_rays))
+                    of_radars.append((noises[-1],))
             clutter += surfels.clutter_ratio() * len(rays)
             returns += len(rays)
             # Of the cells beyond, the tile has only the returns whose rays cross it.
@@ -224,17 +264,38 @@ class _Planner:
             "clutter_ratio": clutter / returns,
             "returns_per_cell": in_cells / max(cells, 1),
         }
-        config = plan.config.override(returns=noise.settings)
-        tiles = sorted(tiles, key=lambda tile: tile.tile)
+        radars, of_radar = [], map(SensorNoise.median, zip(*of_radars, strict=True))
+        same_unit = _median_units(units)
+        for radar, own, unit in zip(plan.radars, of_radar, same_unit, strict=True):
+            model = dataclasses.replace(radar.sensor, noise=own, unit=unit)
+            radars.append(dataclasses.replace(radar, sensor=model))
+        sensor = self._sensor(zip(self._radars.values(), same_unit, strict=True))
         return dataclasses.replace(
-            plan, config=config, sensor=self._sensor(noise), tiles=tuple(tiles), **of_cells
+            plan,
+            config=plan.config.override(returns=noise.settings),
+            sensor=dataclasses.replace(sensor, noise=noise),
+            radars=tuple(radars),
+            tiles=tuple(sorted(tiles, key=lambda tile: tile.tile)),
+            **of_cells,
         )
 
-    def _sensor(self, noise: SensorNoise) -> Sensor:
-        points = [scan.points for _, scan in self._samples]
-        values = [scan.intensities for _, scan in self._samples if scan.intensities is not None] or None
+    def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
+        """Estimate a sensor without noise from the samples of radars, with the intensities in one unit."""
+        points, values = [], []
+        for own, (gain, offset) in radars:
+            for _, scan in own.samples:
+                points.append(scan.points)
+                if scan.intensities is not None:
+                    values.append((np.asarray(scan.intensities) - offset) / gain)
         limits = {name: getattr(self._config.returns, name) for name in ("min_range_m", "max_range_m")}
-        return Sensor.of(points, values, noise=noise, **limits)
+        return Sensor.of(points, values or None, **limits)
+
+
+def _median_units(of_tiles: list[tuple[Unit | None, ...]]) -> list[Unit]:
+    """Medians of the units of each radar, of the tiles in which they are relative to the first radar; `_SAME` without any."""
+    alike = [units for units in of_tiles if units[0] == _SAME] or of_tiles[:1]
+    each = ([unit for unit in of_radar if unit is not None] for of_radar in zip(*alike, strict=True))
+    return [tuple(np.median(units or [_SAME], axis=0).tolist()) for units in each]
 
 
 def rays_path(folder: Path, tile: Tile) -> Path:
@@ -251,13 +312,21 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
     of_scans = np.array(array_in(folder / SCANS_FILE)[numbers])  # a memory map, of which few rows are read
     points = np.ascontiguousarray(rows["point"])
-    intensities = None
-    if plan.intensity_range is not None:
-        intensities = Plausible(*plan.intensity_range).kept(rows["intensity"])
     origin = plan.config.lattice.position(tile.origin_cells)
-    positions, up = (of_scans[:, :3] - origin)[scans], np.ascontiguousarray(of_scans[:, 3:])
-    of_rays: dict[str, Any] = {"origin": origin, "intensities": intensities, "scans": scans.astype(np.int32)}
+    positions, up = (of_scans[:, :3] - origin)[scans], np.ascontiguousarray(of_scans[:, 3:6])
+    of_rays: dict[str, Any] = {"origin": origin, "intensities": None, "scans": scans.astype(np.int32)}
     rays = rays_from(points, positions, up_of_scan=up, **of_rays)
+    if plan.sensors:
+        radar_of_scan = of_scans[:, 6].astype(np.int32)
+        rays = dataclasses.replace(rays, sensor_of_scan=radar_of_scan, num_sensors=len(plan.radars))
+    if plan.intensity_range is not None:
+        values = np.full(len(rows), np.nan, np.float32)
+        for radar, own in zip(plan.radars, rays.rows_of_sensors(), strict=True):
+            if radar.intensity_range is not None:
+                gain, offset = radar.sensor.unit
+                kept = Plausible(*radar.intensity_range).kept(rows["intensity"][own])
+                values[own] = (kept - np.float32(offset)) / np.float32(gain)
+        rays = dataclasses.replace(rays, intensities=values)
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
     halo = round(plan.halo_m / plan.config.leaf_size_m)
     lower = np.array(tile.tile) * plan.tile_cells - plan.origin_cells(tile.tile)[:2] - halo
