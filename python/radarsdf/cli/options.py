@@ -200,7 +200,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "--min-area": (_FLOAT | {"metavar": "M2", "default": 0.1}, "smallest region to list; default: 0.1 m2"),
     "--heights": ({"type": float, "nargs": 2, "default": (0.3, 2.0), "metavar": ("LOW", "HIGH")},
                   "range of heights above the ground that the .yaml map covers, m; default: 0.3 2.0"),
-    "--distances": (_FILE, "also write the Euclidean distance field of the grid, as .npz"),
+    "--distances": (_FILE, "also write the Euclidean distances of the grid: .npz, or .vdb for OpenVDB"),
     "--costmap": (_FILE, "also write heights, slopes, steps and traversal costs, as .npz"),
     "--tile-size": (_FLOAT, "edge of a tile; default: 512 leaf cells"),
     "--halo": (_FLOAT, "margin of returns around a tile that are fitted, too; default: 64 leaf cells"),

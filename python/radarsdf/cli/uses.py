@@ -8,7 +8,7 @@ from radarsdf.changes.compare import compare as compare_maps
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, scans_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.extras import require
-from radarsdf.grids.grid import save_arrays
+from radarsdf.grids.grid import DISTANCE_SUFFIXES, save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.meshes import MESH_SUFFIXES
@@ -70,8 +70,9 @@ def grid(given: Namespace, results: Results) -> None:
     flat = [path for path in out if path.suffix.lower() == ".yaml"]
     for path in out:
         checked_suffix(path, (".npz", ".bt", ".yaml"), "grids")
-    for arrays_path in filter(None, (given.distances, given.costmap)):
-        checked_suffix(arrays_path, (".npz",), "arrays of a grid")
+    for arrays_path, suffixes in ((given.distances, DISTANCE_SUFFIXES), (given.costmap, (".npz",))):
+        if arrays_path is not None:
+            checked_suffix(arrays_path, suffixes, "arrays of a grid")
     if given.picture is not None:
         require("matplotlib", what="pictures need")
     pgm = [path.with_suffix(".pgm") for path in flat]

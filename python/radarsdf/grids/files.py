@@ -1,13 +1,17 @@
-"""File formats of grids: OctoMap's binary octree, and ROS's map_server (YAML and PGM)."""
+"""File formats of grids: OctoMap's binary octree, OpenVDB, and ROS's map_server (YAML and PGM)."""
 
 from __future__ import annotations
 
+import struct
+import zlib
+from os import PathLike
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import Bools, Floats, Floats32, Ints
 from radarsdf.checks import check
 from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 
@@ -16,6 +20,7 @@ _LEVELS = 16  # depth of OctoMap's octree
 _HALF = 1 << (_LEVELS - 1)  # half width of the tree, voxels
 _MOST_OFF = 0.01  # tolerance for rounding of the origin, voxels
 _FREE, _OCCUPIED, _INNER = 1, 2, 3
+_ZIP = 1  # compression of OpenVDB
 
 
 def write_map_server(path: Path, state: NDArray[np.int8], origin: Floats, cell_m: float) -> None:
@@ -76,3 +81,60 @@ def _octree(keys: Ints, codes: Ints) -> tuple[int, bytes]:
     # Pre-order: sort by the number of the first voxel, larger nodes first.
     order = np.lexsort([np.concatenate(levels), np.concatenate(firsts)])
     return size, np.concatenate(words)[order].astype("<u2").tobytes()
+
+
+def write_vdb(
+    path: str | PathLike[str], values: Floats32, known: Bools, origin: Floats, voxel_m: float
+) -> None:
+    """Write values (X, Y, Z) of known voxels as an OpenVDB level set named `distance`; the largest value is the background."""
+    scales = (voxel_m, voxel_m, 1 / voxel_m, 1 / voxel_m**2, 0.5 / voxel_m)
+    # OpenVDB's voxels are points: the centres of ours.
+    transform = np.array([*(origin + 0.5 * voxel_m), *np.repeat(scales, 3)], "<f8").tobytes()
+    words = ("class", "string", "level set", "name", "string", "distance", "UniformScaleTranslateMap")
+    grid = struct.pack("<II", _ZIP, 2) + b"".join(map(_vdb_text, words)) + transform
+    topology, leaves = _vdb_tree(values, known, np.float32(values[known].max(initial=0.0)))
+    header = b" BDV" + struct.pack("<iIII?36sII", 0, 224, 10, 0, True, str(UUID(int=0)).encode(), 0, 1)
+    header += b"".join(map(_vdb_text, ("distance", "Tree_float_5_4_3", "")))
+    offsets = np.cumsum([len(header) + 24, len(grid) + len(topology), len(leaves)]).astype("<i8")
+    write_whole(path, header + offsets.tobytes() + grid + topology + leaves)
+
+
+def _vdb_tree(values: Floats32, known: Bools, background: np.float32) -> tuple[bytes, bytes]:
+    """Encode OpenVDB's tree: its nodes of 4096³, 128³ and 8³ voxels, depth first, and the values of the latter."""
+
+    def leaves(array: NDArray, at: tuple[int, ...]) -> NDArray:  # type: ignore[type-arg]
+        """Return the voxels (4096, 512) of a node of 128³, by leaf."""
+        part = array[tuple(slice(128 * a, 128 * (a + 1)) for a in at)]
+        part = np.pad(part, [(0, 128 - size) for size in part.shape])
+        return part.reshape(16, 8, 16, 8, 16, 8).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 512)
+
+    def node(children: Bools) -> bytes:
+        masks = np.packbits(children, bitorder="little").tobytes() + bytes(len(children) // 8)
+        return masks + _vdb_values(np.full(len(children), background))
+
+    roots: dict[tuple[int, ...], tuple[Bools, list[bytes]]] = {}
+    buffers = []
+    nodes = np.ndindex(*(-(-size // 128) for size in values.shape))
+    for at in sorted(nodes, key=lambda at: [a // 32 for a in at]):
+        active = leaves(known, at)
+        used = np.asarray(active.any(axis=1))
+        if used.any():
+            children, below = roots.setdefault(tuple(a // 32 for a in at), (np.zeros(32**3, bool), []))
+            children[np.ravel_multi_index([a % 32 for a in at], (32, 32, 32))] = True
+            masks = np.packbits(active[used], axis=1, bitorder="little")
+            below.append(node(used) + masks.tobytes())
+            numbers = np.where(active, leaves(values, at), background)[used]
+            buffers += [mask.tobytes() + _vdb_values(leaf) for mask, leaf in zip(masks, numbers, strict=True)]
+    parts = [struct.pack("<IfII", 1, background, 0, len(roots))]
+    for root, (children, below) in roots.items():
+        parts += [(4096 * np.array(root)).astype("<i4").tobytes(), node(children), *below]
+    return b"".join(parts), b"".join(buffers)
+
+
+def _vdb_values(values: Floats32) -> bytes:
+    packed = zlib.compress(values.astype("<f4").tobytes())
+    return b"\x06" + struct.pack("<q", len(packed)) + packed  # all values, not only those that differ
+
+
+def _vdb_text(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()

@@ -15,7 +15,7 @@ from pydantic import Field
 from radarsdf.arrays import Bools, Floats, Floats32
 from radarsdf.checks import check, number, path_of
 from radarsdf.grids.distances import DistanceField, checked_obstacles, checked_positions, distances_to_boxes
-from radarsdf.grids.files import write_map_server, write_octomap
+from radarsdf.grids.files import write_map_server, write_octomap, write_vdb
 from radarsdf.io.files import checked_suffix
 from radarsdf.io.npz import write_arrays
 from radarsdf.settings import settings
@@ -23,6 +23,7 @@ from radarsdf.settings import settings
 UNKNOWN, FREE, OCCUPIED = -1, 0, 1
 LETHAL = 100
 """Cost of a column that the vehicle cannot enter, as in ROS."""
+DISTANCE_SUFFIXES = (".npz", ".vdb")
 _Metres = Annotated[float, Field(gt=0, le=100)]
 
 
@@ -291,8 +292,15 @@ class Grid:
 
 
 def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | DistanceField) -> None:
-    """Write costs or distances of a grid to an ``.npz``, by name, with its `origin` and `voxel_size`."""
-    checked_suffix(path, (".npz",), "arrays of a grid")
+    """Write costs or distances of a grid to an ``.npz``, by name, with its `origin` and `voxel_size`.
+
+    Distances to the surface, in known voxels, also to a ``.vdb``, a level set of OpenVDB.
+    """
+    suffixes = DISTANCE_SUFFIXES if isinstance(found, DistanceField) else (".npz",)
+    if checked_suffix(path, suffixes, "arrays of a grid") == ".vdb":
+        assert isinstance(found, DistanceField)
+        write_vdb(Path(path), found.surface_m, found.known, found.origin, found.voxel_size)
+        return
     arrays = {name: values for name, values in vars(found).items() if not name.startswith("_")}
     write_arrays(path, {"origin": grid.origin, "voxel_size": grid.voxel_size, **arrays}, compressed=True)
 

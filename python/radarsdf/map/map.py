@@ -13,7 +13,16 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from radarsdf.arrays import Array, Bools, Floats
-from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, instance, real_array
+from radarsdf.checks import (
+    MAX_POSITION_M,
+    AnyPath,
+    check,
+    check_pose,
+    instance,
+    positive,
+    real_array,
+    whole_number,
+)
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -21,6 +30,8 @@ from radarsdf.map.confidence import EvidenceAt, confidence, uncertainty
 from radarsdf.map.contents import MapContents
 from radarsdf.map.free_space import CellsInBox, free_space_odds
 from radarsdf.map.threshold import VOXEL_M
+from radarsdf.memory import check_views
+from radarsdf.products import turned
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatisticsAt
@@ -29,7 +40,7 @@ from radarsdf.rig import Label
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.view import View, ViewedMap
+    from radarsdf.map.view import DepthImage, View, ViewedMap
 
 Query = Callable[..., Array]
 
@@ -292,6 +303,61 @@ class Map(ABC):
         radar = self._radar(sensor)
         viewed = self._viewed_from(pose[:3, 3], radar.range_m[1])
         return view_from(viewed, pose, radar, returns, noise=noise, seed=seed)
+
+    def render_depth(
+        self,
+        T_world_camera: ArrayLike,
+        camera: ArrayLike,
+        size: tuple[int, int],
+        *,
+        max_range_m: float = 100.0,
+    ) -> DepthImage:
+        """Render the surface that :meth:`mesh` keeps by default, as seen by a pinhole camera.
+
+        Parameters
+        ----------
+        T_world_camera : (4, 4) array_like
+            Pose of the camera, m: x right, y down, z forward, as in OpenCV and ROS's optical frames.
+        camera : (3, 3) array_like
+            Intrinsic matrix, pixels, as ``K`` of ROS's ``CameraInfo``. Pixel centres are integers.
+        size : (int, int)
+            Width and height of the image, pixels.
+        max_range_m : float
+            Largest distance of surface from the camera, m.
+
+        Returns
+        -------
+        DepthImage
+            Depth, normals and :meth:`confidence` of each pixel.
+
+        Raises
+        ------
+        ValueError
+            If the pose is not a rigid transform, the matrix is singular, or another argument is out of range.
+        MemoryError
+            If the image would need more memory than available.
+        """
+        from radarsdf.map.view import DepthImage  # noqa: PLC0415 - as above
+
+        pose, K = check_pose(T_world_camera, "T_world_camera"), real_array(camera, "camera")
+        invertible = K.shape == (3, 3) and np.linalg.matrix_rank(K) == 3
+        check(invertible, f"camera must be an invertible (3, 3) matrix, not {K}")
+        width, height = (whole_number(count, "size", 1) for count in size)
+        check_views(self.config.max_memory_bytes, beams=width * height)
+        range_m, position = positive(max_range_m, "max_range_m"), pose[:3, 3]
+        viewed = self._viewed_from(position, range_m)
+        v, u = np.indices((height, width)).reshape(2, -1)
+        pixels = np.stack([u, v, np.ones_like(u)], axis=1)
+        rays = turned(turned(pixels, np.linalg.inv(K)), pose[:3, :3])  # depth 1
+        length = np.linalg.norm(rays, axis=1)
+        depth_m = viewed.ranges(position - viewed.origin, rays / length[:, None], range_m) / length
+        seen = np.isfinite(depth_m)
+        points = position + depth_m[seen, None] * rays[seen]
+        image = np.full((height, width, 5), np.nan, np.float32)
+        image[seen.reshape(height, width)] = np.column_stack(
+            [depth_m[seen], self.tangent_planes(points)[1], self.confidence(points)]
+        )
+        return DepthImage(image[..., 0], image[..., 1:4], image[..., 4])
 
     def _radar(self, sensor: Sensor | Label | None) -> Sensor:
         if sensor is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,6 +83,17 @@ def scans_of_views(views: Iterable[View]) -> Scans:
     poses = np.array([view.T_world_sensor for view in kept]).reshape(-1, 4, 4)
     values = [view.intensities for view in kept if view.intensities is not None]
     return Scans([view.points for view in kept], poses, values if len(values) == len(kept) else None)
+
+
+class DepthImage(NamedTuple):
+    """Surface seen by a camera. NaN in pixels without surface."""
+
+    depth_m: Floats32
+    """(height, width) distance of the surface along the optical axis, m."""
+    normals: Floats32
+    """(height, width, 3) unit normals, world frame, towards free space."""
+    confidence: Floats32
+    """(height, width) :meth:`Map.confidence` of the surface."""
 
 
 @dataclass(frozen=True, eq=False)
