@@ -67,7 +67,7 @@ def test_smoothing_improves_surfaces_of_low_curvature(monkeypatch):
     points = [points[0] + [0, 0, 1] * rng.normal(0, 0.08, (len(points[0]), 1))]
     x = inner_points()
     smoothed = np.square(fit(points, poses).sdf(x) - x[:, 2]).mean()
-    monkeypatch.setattr("radarsdf.fitting.average._SMOOTHINGS", 0)
+    monkeypatch.setattr("radarsdf.fitting.surface_returns._SMOOTHINGS", 0)
     assert smoothed < np.square(fit(points, poses).sdf(x) - x[:, 2]).mean() * 2 / 3
 
 

@@ -18,11 +18,10 @@ from radarsdf.checks import AnyPath
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
-from radarsdf.fitting.average import average_surface
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
 from radarsdf.fitting.schedule import Schedule
-from radarsdf.fitting.surface_returns import SurfaceReturns, occupied_cells
+from radarsdf.fitting.surface_returns import SurfaceReturns, average_surface, occupied_cells
 from radarsdf.fitting.train import Diverged, Interrupted, Training
 from radarsdf.map.contents import Deferred, MapContents
 from radarsdf.map.queries import evaluate
