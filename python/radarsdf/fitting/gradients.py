@@ -179,16 +179,16 @@ class AutogradGradients(GradientBackend):
         # The intensity network sees the leading samples of each part.
         seen = sizes if self._config.training.intensity_in_free_space else labelled
         dropouts = [] if losses == "sdf" else self._draw_dropouts()
-        factors = [kept.factors(sum(seen), width).split(seen) for width, kept in dropouts]
-        columns = [torch.from_numpy(c).split(sizes) for c in (batch.points, batch.sdf_m, batch.of_ray)]
+        factors = [torch.split_with_sizes(kept.factors(sum(seen), width), seen) for width, kept in dropouts]
+        arrays = map(torch.from_numpy, (batch.points, batch.sdf_m, batch.of_ray))
+        columns = [torch.split_with_sizes(column, sizes) for column in arrays]
 
         def of_part(i: int) -> Gradients:
             # Parts may differ in size, and some of a small batch are empty.
             shares = [counts[i] / max(sum(counts), 1) for counts in (sizes, seen)]
-            of_columns = (column[i] for column in columns)
-            return self._of_part(
-                losses, *of_columns, labelled[i], seen[i], shares, [kept[i] for kept in factors]
-            )
+            points, sdf_m, of_ray = (column[i] for column in columns)
+            kept = [of_encoding[i] for of_encoding in factors]
+            return self._of_part(losses, points, sdf_m, of_ray, labelled[i], seen[i], shares, kept)
 
         parts = list(self._pool.map(of_part, range(len(sizes))))
         total = parts[0].by_parameters
