@@ -5,7 +5,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.field.field import GridField
-from radarsdf.fitting import steps
+from radarsdf.fitting.fit import _in_order
 from radarsdf.fitting.surface_returns import SurfaceReturns
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
@@ -67,7 +67,7 @@ def test_smoothing_improves_surfaces_of_low_curvature(monkeypatch):
     points = [points[0] + [0, 0, 1] * rng.normal(0, 0.08, (len(points[0]), 1))]
     x = inner_points()
     smoothed = np.square(fit(points, poses).sdf(x) - x[:, 2]).mean()
-    monkeypatch.setattr("radarsdf.fitting.average._SMOOTHINGS", 0)
+    monkeypatch.setattr("radarsdf.fitting.surface_returns._SMOOTHINGS", 0)
     assert smoothed < np.square(fit(points, poses).sdf(x) - x[:, 2]).mean() * 2 / 3
 
 
@@ -85,11 +85,11 @@ def test_of_many_returns_a_sample_is_even_among_scans_and_places(monkeypatch):
     scans = radarsdf.simulate.wall(frames=12, seed=2)
     rays = prepare(scans.points, scans.poses)
     surfels = Surfels.of(rays, 0.2)
-    assert len(steps._in_order(rays, surfels, 1)) == len(rays)
-    monkeypatch.setattr(steps, "_ENOUGH_RETURNS", 1)
+    assert len(_in_order(rays, surfels, 1)) == len(rays)
+    monkeypatch.setattr("radarsdf.fitting.fit._ENOUGH_RETURNS", 1)
     planes = np.count_nonzero(surfels.is_flat())
-    monkeypatch.setattr(steps, "_ENOUGH_PER_PLANE", len(rays) // (3 * planes))
-    sample = steps._in_order(rays, surfels, 1)
+    monkeypatch.setattr("radarsdf.fitting.fit._ENOUGH_PER_PLANE", len(rays) // (3 * planes))
+    sample = _in_order(rays, surfels, 1)
     assert len(rays) / 5 < len(sample) < len(rays) / 2
     share = len(sample) / len(rays)
     for groups in (lambda r: r.scans, lambda r: (r.points[:, 1] // 4).astype(int) + 100):

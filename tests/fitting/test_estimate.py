@@ -52,7 +52,7 @@ def test_sizes_are_within_a_factor_of_two(scene, config):
 
 def test_a_fit_beyond_the_budget_is_rejected_before_allocation(scene, monkeypatch):
     config = SHORT.override(max_memory_bytes=30_000_000)
-    monkeypatch.setattr("radarsdf.fitting.steps.SurfaceReturns.of", lambda *_: pytest.fail("began"))
+    monkeypatch.setattr("radarsdf.fitting.fit.SurfaceReturns.of", lambda *_: pytest.fail("began"))
     with pytest.raises(MemoryError, match=r"0\.03 GB .*9000 returns"):
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
 

@@ -1,11 +1,12 @@
 """Samples along rays: labels are geometric, and all rays are sampled equally."""
 
 import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from radarsdf import FitConfig
+from radarsdf import FitConfig, _core
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.returns.rays import prepare
 
@@ -40,7 +41,17 @@ def sensors_of(rays, samples):
     return points, points - rays.directions[index].astype(np.float64) * rays.ranges_m[index, None]
 
 
-DRAWS = {"batch": lambda draw: draw.batch().split()[0], "spread": lambda draw: draw.spread(256).split()[0]}
+def split(batch):
+    """Samples of each part of a batch, as tensors."""
+    sizes, labelled = zip(*batch.parts, strict=True)
+    columns = [torch.from_numpy(c).split(sizes) for c in (batch.points, batch.sdf_m, batch.of_ray)]
+    names = ("points", "sdf_m", "of_ray", "num_labelled")
+    return [
+        SimpleNamespace(**dict(zip(names, of, strict=True))) for of in zip(*columns, labelled, strict=True)
+    ]
+
+
+DRAWS = {"batch": lambda draw: split(draw.batch())[0], "spread": lambda draw: split(draw.spread(256))[0]}
 
 
 @pytest.mark.parametrize("kind", DRAWS)
@@ -60,7 +71,7 @@ def test_ranges_of_the_samples(rays):
     draw = sampler(rays, 512)
     near, free, lowest_share = [], [], []
     for _ in range(40):
-        samples = draw.batch().split()[0]
+        samples = split(draw.batch())[0]
         range_m = torch.from_numpy(rays.ranges_m)[rows_of(rays.points, samples)][256:]
         near.append(samples.sdf_m[:256])
         from_sensor = range_m - samples.sdf_m[256:]
@@ -83,7 +94,7 @@ def test_each_ray_is_sampled_equally_often(rays, batch_size, neighbours):
     seen = np.zeros((2, NUM_RAYS), int)
     batches = 4 * NUM_RAYS * 2 // batch_size
     for _ in range(batches):
-        samples = draw.batch().split()[0]
+        samples = split(draw.batch())[0]
         rows = rows_of(rays.points, samples)
         for kind, part in enumerate((rows[: batch_size // 2], rows[batch_size // 2 :])):
             np.add.at(seen[kind], part.numpy(), 1)
@@ -106,7 +117,7 @@ def test_memory_of_a_batch_is_independent_of_the_number_of_rays(rays, kind):
 
 
 def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
-    samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS).split()[0]
+    samples = split(sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS))[0]
     index = rows_of(rays.points, samples).numpy()
     offset = samples.points.numpy() - rays.points[index]
     along = (offset * rays.directions[index]).sum(axis=1)
@@ -121,7 +132,7 @@ def test_the_number_of_intensity_labels_is_limited(rays, parts):
     config = FitConfig(training={"intensity_batch_size": 24})
     generator, unit = torch.Generator().manual_seed(0), torch.linspace(0, 1, NUM_RAYS)
     draw = RaySampler(rays, config, 288, generator, 6, unit)
-    batches = [draw.batch(parts).split() for _ in range(NUM_RAYS // 24 * 12)]
+    batches = [split(draw.batch(parts)) for _ in range(NUM_RAYS // 24 * 12)]
     assert {sum(part.num_labelled for part in batch) for batch in batches} == {24}
     for batch in batches[:5]:
         for part in batch:
@@ -129,18 +140,20 @@ def test_the_number_of_intensity_labels_is_limited(rays, parts):
             assert (part.sdf_m[:near].abs() <= NEAR_M).all()
             assert (part.sdf_m[near:].abs() > NEAR_M).float().mean() > 0.8
             assert 0 <= part.num_labelled - 24 // parts <= 1
-    labelled = torch.cat([part.intensities[: part.num_labelled] for batch in batches for part in batch])
+    labelled = torch.cat(
+        [part.of_ray[: part.num_labelled, _core.RAY_INTENSITY] for batch in batches for part in batch]
+    )
     assert len(torch.unique(labelled)) > 0.9 * NUM_RAYS
     # All near samples are labelled without intensities, and if free space has its own label.
-    assert RaySampler(rays, config, 288, generator).batch().split()[0].num_labelled == 144
+    assert split(RaySampler(rays, config, 288, generator).batch())[0].num_labelled == 144
     free = config.override(training={"intensity_in_free_space": True})
-    assert RaySampler(rays, free, 288, generator, 1, unit).batch().split()[0].num_labelled == 144
+    assert split(RaySampler(rays, free, 288, generator, 1, unit).batch())[0].num_labelled == 144
 
 
 @pytest.mark.parametrize("parts", [2, 3])
 def test_parts_partition_the_batch(rays, parts):
-    (whole,) = sampler(rays, 250).batch().split()
-    found = sampler(rays, 250).batch(parts).split()
+    (whole,) = split(sampler(rays, 250).batch())
+    found = split(sampler(rays, 250).batch(parts))
     sizes, near = [len(part.points) for part in found], [part.num_labelled for part in found]
     for counts, total in ((sizes, 250), (near, 125)):  # without intensities, all near samples have labels
         assert sum(counts) == total
@@ -155,9 +168,10 @@ def test_parts_partition_the_batch(rays, parts):
     assert torch.equal(torch.cat([near, free]), whole.of_ray)
     for part in found:
         rows = rows_of(rays.points, part)
-        assert torch.equal(part.ranges_m, torch.from_numpy(rays.ranges_m)[rows])
+        assert torch.equal(part.of_ray[:, _core.RAY_RANGE], torch.from_numpy(rays.ranges_m)[rows])
         assert (part.sdf_m[: part.num_labelled].abs() <= NEAR_M).all()
-        gap = part.points + part.sdf_m[:, None] * part.directions - torch.from_numpy(rays.points)[rows]
+        directions = part.of_ray[:, _core.RAY_DIRECTION : _core.RAY_RANGE]
+        gap = part.points + part.sdf_m[:, None] * directions - torch.from_numpy(rays.points)[rows]
         assert gap.abs().max() < 2e-5
 
 

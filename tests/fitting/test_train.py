@@ -8,10 +8,8 @@ from radarsdf import FitConfig
 from radarsdf.fitting import schedule as fitting_schedule
 from radarsdf.fitting import train
 from radarsdf.fitting.gradients import CoreGradients, sdf_loss
-from radarsdf.fitting.sampling import RaySampler
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import LossHistory
-from radarsdf.returns.rays import prepare
 
 from ..settings import grouped
 from .extreme import CASES, fitted, free_and_solid
@@ -106,17 +104,6 @@ def test_joint_iterations_are_spread_over_the_sdf_stage(scene, monkeypatch):
     joint = [-1, *(i for i, kind in enumerate(kinds) if kind == "joint")]
     assert (len(joint) - 1, joint[-1] + 1) == (10, done["sdf"])
     assert np.ptp(np.diff(joint)) <= 1
-
-
-@pytest.mark.parametrize("batch_size", [1, 5, 101])
-@pytest.mark.parametrize("parts", [1, 3, 16])
-def test_parts_are_weighted_by_their_samples(scene, batch_size, parts):
-    rays = prepare(scene.points, scene.poses)
-    draw = RaySampler(rays, FitConfig(), batch_size, torch.Generator().manual_seed(0))
-    for batch in (draw.batch(parts).split(), draw.spread(batch_size, parts).split()):
-        sizes, labelled = [len(part.points) for part in batch], [part.num_labelled for part in batch]
-        assert [part.share for part in batch] == [size / sum(sizes) for size in sizes]
-        assert [part.labelled_share for part in batch] == [count / sum(labelled) for count in labelled]
 
 
 def test_frozen_geometry_is_unchanged(scene):

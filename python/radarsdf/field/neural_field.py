@@ -33,11 +33,11 @@ class Geometry:
     feature: Tensor  # (N, geometry_feature_dim), an input of the intensity network
     normals: Tensor | None  # (N, 3) unit vectors towards free space, if the intensity network uses them
 
-    def first(self, count: int, factors: Sequence[Tensor] | None) -> Geometry:
-        """Return the first `count` points, with each part of the encoding multiplied by its dropout `factors`."""
+    def first(self, count: int, factors: Sequence[Tensor]) -> Geometry:
+        """Return the first `count` points, with each part of the encoding multiplied by its dropout `factors`, if any."""
         normals = None if self.normals is None else self.normals[:count]
         encoding = tuple(part[:count] for part in self.encoding)
-        if factors is not None:
+        if factors:
             encoding = tuple(part * kept for part, kept in zip(encoding, factors, strict=True))
         return Geometry(encoding, self.logit[:count], self.feature[:count], normals)
 

@@ -16,9 +16,9 @@ from radarsdf.arrays import Bools
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
-from radarsdf.fitting.average import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS, seen_jointly
 from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.surface_returns import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.memory import available_bytes
 from radarsdf.returns.ghosts import FEWEST_SAMPLED
 from radarsdf.returns.rays import Rays, prepare

@@ -7,9 +7,8 @@ the time. Tests check that the two agree up to rounding.
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -22,8 +21,8 @@ from radarsdf import _core
 from radarsdf.arrays import Array, Ints32
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field import kernels
-from radarsdf.field.neural_field import Geometry, NeuralField, cells_width, fourier_width
-from radarsdf.fitting.sampling import Batch, Dropout, Samples
+from radarsdf.field.neural_field import NeuralField, cells_width, fourier_width
+from radarsdf.fitting.sampling import Batch, Dropout
 from radarsdf.threads import ThreadPool
 
 # Dropout of the features and of the Fourier encoding before the intensity network, scaled by n / (n + 2.5) if the training
@@ -176,65 +175,58 @@ class AutogradGradients(GradientBackend):
         return min(self._pool.num_threads, batch_size)
 
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        parts = batch.split()
-        factors: list[list[Tensor] | None] = [None] * len(parts)
-        if losses != "sdf" and (dropouts := self._draw_dropouts()):
-            seen = [self._num_seen(samples) for samples in parts]
-            of_encodings = [
-                torch.split_with_sizes(dropout.factors(sum(seen), columns, parts[0].points.dtype), seen)
-                for columns, dropout in dropouts
-            ]
-            factors = [list(of_part) for of_part in zip(*of_encodings, strict=True)]
-        of_part = functools.partial(self._of_part, losses)
-        return _sum(list(self._pool.map(of_part, list(zip(parts, factors, strict=True))))), meanwhile()
+        sizes, labelled = map(list, zip(*batch.parts, strict=True))
+        # The intensity network sees the leading samples of each part.
+        seen = sizes if self._config.training.intensity_in_free_space else labelled
+        dropouts = [] if losses == "sdf" else self._draw_dropouts()
+        factors = [torch.split_with_sizes(kept.factors(sum(seen), width), seen) for width, kept in dropouts]
+        arrays = map(torch.from_numpy, (batch.points, batch.sdf_m, batch.of_ray))
+        columns = [torch.split_with_sizes(column, sizes) for column in arrays]
 
-    def _num_seen(self, samples: Samples) -> int:
-        """Return the number of leading samples that the intensity network sees."""
-        return len(samples.points) if self._config.training.intensity_in_free_space else samples.num_labelled
+        def of_part(i: int) -> Gradients:
+            # Parts may differ in size, and some of a small batch are empty.
+            shares = [counts[i] / max(sum(counts), 1) for counts in (sizes, seen)]
+            points, sdf_m, of_ray = (column[i] for column in columns)
+            kept = [of_encoding[i] for of_encoding in factors]
+            return self._of_part(losses, points, sdf_m, of_ray, labelled[i], seen[i], shares, kept)
 
-    def _of_part(self, losses: Losses, part: tuple[Samples, list[Tensor] | None]) -> Gradients:
-        """Differentiate one part: samples, and dropout factors of the encoding of those that the network sees."""
-        field, (samples, factors) = self._field, part
-        found, parameters = {}, []
+        parts = list(self._pool.map(of_part, range(len(sizes))))
+        total = parts[0].by_parameters
+        for part in parts[1:]:
+            torch._foreach_add_(total, part.by_parameters)
+        summed = {name: sum(part.losses[name] for part in parts) for name in parts[0].losses}
+        return Gradients(summed, total, None), meanwhile()
+
+    def _of_part(
+        self,
+        losses: Losses,
+        points: Tensor,
+        sdf_m: Tensor,
+        of_ray: Tensor,
+        labelled: int,
+        seen: int,
+        shares: list[float],
+        factors: list[Tensor],
+    ) -> Gradients:
+        """Differentiate the losses of one part, with its `shares` of the means of the batch, and its dropout `factors`."""
+        field, found, parameters = self._field, {}, list[Tensor]()
         if losses == "sdf":
-            found["sdf"] = self._sdf_loss(field.logit(samples.points), samples)
+            logit = field.logit(points)
         else:
-            geometry = field.geometry(samples.points, frozen=losses == "intensity")
-            found["intensity"] = self._intensity_loss(geometry, samples, factors)
-            if losses == "joint":
-                found["sdf"] = self._sdf_loss(geometry.logit, samples)
-        if "sdf" in found:
-            parameters += [field.cells.features, *field.sdf_network.parameters()]
-        if "intensity" in found:
             assert field.intensity_network is not None
+            geometry = field.geometry(points, frozen=losses == "intensity")
+            logit, rays = geometry.logit, of_ray[:seen]
+            ranges_m = rays[:, _core.RAY_RANGE] - sdf_m[:seen]
+            directions = rays[:, _core.RAY_DIRECTION : _core.RAY_RANGE]
+            predicted = field.intensity_network(geometry.first(seen, factors), directions, ranges_m)
+            labels = rays[:, _core.RAY_INTENSITY].clone()
+            labels[labelled:] = 0  # free space returns nothing (3QFPI)
+            # The mean of no samples would be NaN.
+            found["intensity"] = intensity_loss(predicted, labels) * shares[1] if seen else predicted.sum()
+        if losses != "intensity":
+            found["sdf"] = sdf_loss(logit, sdf_m, field.sigma_m) * shares[0] if len(logit) else logit.sum()
+            parameters += [field.cells.features, *field.sdf_network.parameters()]
+        if field.intensity_network is not None and "intensity" in found:
             parameters += field.intensity_network.parameters()
         gradients = list(torch.autograd.grad(torch.stack(list(found.values())).sum(), parameters))
         return Gradients({name: float(loss.detach()) for name, loss in found.items()}, gradients, None)
-
-    def _sdf_loss(self, logit: Tensor, samples: Samples) -> Tensor:
-        if len(logit) == 0:  # the mean would be NaN
-            return logit.sum()
-        return sdf_loss(logit, samples.sdf_m, self._field.sigma_m) * samples.share
-
-    def _intensity_loss(self, geometry: Geometry, samples: Samples, factors: list[Tensor] | None) -> Tensor:
-        count = self._num_seen(samples)
-        labels = samples.intensities[:count].clone()
-        labels[samples.num_labelled :] = 0  # free space returns nothing (3QFPI)
-        assert self._field.intensity_network is not None
-        ranges_m = samples.ranges_m[:count] - samples.sdf_m[:count]
-        encoded = geometry.first(count, factors)
-        predicted: Tensor = self._field.intensity_network(encoded, samples.directions[:count], ranges_m)
-        if count == 0:
-            return predicted.sum()
-        # Weight of this mean in that of the whole batch.
-        share = samples.share if self._config.training.intensity_in_free_space else samples.labelled_share
-        return intensity_loss(predicted, labels) * share
-
-
-def _sum(parts: Sequence[Gradients]) -> Gradients:
-    """Sum losses and gradients of all parts, in place in the first part."""
-    first, *others = parts
-    for part in others:
-        torch._foreach_add_(first.by_parameters, part.by_parameters)
-    losses = {name: sum(part.losses[name] for part in parts) for name in first.losses}
-    return Gradients(losses, first.by_parameters, None)

@@ -42,48 +42,15 @@ def seen_jointly(config: FitConfig, batch_size: int) -> int:
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Samples on rays, those near the surface first."""
-
-    points: Tensor  # (B, 3) float32, local frame, m
-    sdf_m: Tensor  # (B,) label: distance along the ray to the return, m, positive in front of it
-    num_labelled: int  # number of leading samples with intensity labels
-    of_ray: Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; optionally scaled intensity
-    share: float = 1.0  # weight of the mean of a part in that of the batch; 0 without samples
-    labelled_share: float = 1.0  # the same for the labelled samples
-
-    @property
-    def directions(self) -> Tensor:
-        return self.of_ray[:, _core.RAY_DIRECTION : _core.RAY_RANGE]
-
-    @property
-    def ranges_m(self) -> Tensor:
-        return self.of_ray[:, _core.RAY_RANGE]
-
-    @property
-    def intensities(self) -> Tensor:
-        return self.of_ray[:, _core.RAY_INTENSITY]
-
-
-@dataclass(frozen=True)
 class Batch:
-    """Samples in consecutive parts. One thread processes each part."""
+    """B samples on rays, in consecutive parts, each with the samples near the surface first. One thread processes each part."""
 
-    points: Floats32  # (B, 3), see :class:`Samples`
-    sdf_m: Floats32  # (B,)
-    of_ray: Floats32  # (B, 7 or 8)
-    parts: list[tuple[int, int]]  # numbers of samples and of leading labelled samples of each part
-
-    def split(self) -> list[Samples]:
-        sizes, labelled = map(list, zip(*self.parts, strict=True))
-        arrays = map(torch.from_numpy, (self.points, self.sdf_m, self.of_ray))
-        columns = [torch.split_with_sizes(column, sizes) for column in arrays]
-        # Parts may differ in size, and some of a small batch are empty. Each of n equal parts has the exact share 1 / n.
-        shares = ([count / max(sum(counts), 1) for count in counts] for counts in (sizes, labelled))
-        return [
-            Samples(x, sdf, num_labelled, of_ray, *shares_of_part)
-            for x, sdf, of_ray, num_labelled, *shares_of_part in zip(*columns, labelled, *shares, strict=True)
-        ]
+    points: Floats32  # (B, 3) local frame, m
+    sdf_m: Floats32  # (B,) label: distance along the ray to the return, m, positive in front of it
+    of_ray: Floats32  # (B, 7 or 8) return (3), local, m; direction (3); range, m; optionally scaled intensity
+    parts: list[
+        tuple[int, int]
+    ]  # numbers of samples and of leading samples with intensity labels of each part
 
 
 class RaySampler:
@@ -177,7 +144,7 @@ class RaySampler:
 
 
 def _in_morton_order(rays: Rays, values: Tensor | None, leaf_size_m: float, num_threads: int) -> Floats32:
-    """Return :attr:`Samples.of_ray` for all rays, in Morton order of their returns."""
+    """Return :attr:`Batch.of_ray` for all rays, in Morton order of their returns."""
     # A ray is one row of 32 bytes, half a cache line: a batch reads it by one gather.
     order = _core.stable_order(_core.cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
@@ -245,8 +212,8 @@ class Dropout:
         """Draw a seed. `dropout`: probability that an element is dropped."""
         return cls(draw_seed(generator), round(256 * (1 - dropout)))
 
-    def factors(self, rows: int, columns: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    def factors(self, rows: int, columns: int) -> Tensor:
         """Return factors (rows, columns): 0 for dropped elements, 256 / keep for the others, so that the mean is 1."""
         bytes_ = _core.random_bytes(self.seed, rows, columns)
         # not < keep: 256 does not fit into a byte
-        return torch.from_numpy(bytes_ <= self.keep - 1).to(dtype) * (256 / self.keep)
+        return torch.from_numpy(bytes_ <= self.keep - 1).float() * (256 / self.keep)

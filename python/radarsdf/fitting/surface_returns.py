@@ -1,17 +1,21 @@
-"""The returns from which the surface is fitted: without ghosts, and for training moved towards flat surfels."""
+"""The returns from which the surface is fitted, the leaf cells near them, and the surface without training.
+
+Returns are without ghosts, and for training moved towards flat surfels. Without training, the surface is the smoothed average
+of signed distances at the corners of leaf cells.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+import torch
 
-from radarsdf._core import CellSet
-from radarsdf.arrays import Bools, Ints32, Keys
+from radarsdf._core import CellSet, VertexTable
+from radarsdf.arrays import Bools, Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.average import BAND_CELLS
+from radarsdf.field.field import GridField
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS
 from radarsdf.returns.evidence import ReturnsOfCells, bridged
 from radarsdf.returns.ghosts import find_ghosts
@@ -44,75 +48,45 @@ class SurfaceReturns:
         noise: SensorNoise | None = None,
     ) -> SurfaceReturns:
         """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`, `noise`: of the rays, if known."""
-        needed_later = config.returns.free_space or inside is not None or noise is not None
-        by_return = config.train or (config.returns.drop_ghosts and needed_later)
-        weights = None if noise is None else noise.weights(rays)
-        cells = _cells_of(rays, config, sums, by_return, num_threads, weights)
+        leaf_m, cleaning, leaves = config.leaf_size_m, config.returns, None
+        needed_later = cleaning.free_space or inside is not None or noise is not None
+        if sums is None:
+            leaves = ReturnCells.of(rays, leaf_m, num_threads)
+            weights = None if noise is None else noise.weights(rays)
+            sums = ScanSums.of_cells(rays, leaves, leaf_m, num_threads, weights)
+        surfels = Surfels.of_sums(sums, num_threads)
+        means = None if config.train else MeanRays.of_sums(sums, num_threads)
+        cells, true, kept = None, None, inside  # cells (N,): row of the surfel's cell of each return
+        if config.train or (cleaning.drop_ghosts and needed_later):
+            if leaves is None:
+                cells = surfels.cells_at(rays.points, num_threads)
+            else:
+                cells = surfels.cells_of_leaves(leaves.keys, num_threads)[leaves.cell_of_ray]
+        del leaves, sums  # frees memory
         if noise is None:
-            noise = sensor_noise(cells.surfels, rays, config.returns, num_threads)
-        clean = _returns_to_train if config.train else _returns_to_average
-        return clean(rays, cells, noise, config, inside, num_threads)
-
-
-class _Cells(NamedTuple):
-    surfels: Surfels
-    means: MeanRays | None  # None for training
-    of_rays: Ints32 | None  # (N,) row of the surfel's cell of each return, if asked for
-
-
-def _cells_of(
-    rays: Rays,
-    config: FitConfig,
-    sums: ScanSums | None,
-    by_return: bool,
-    num_threads: int,
-    weights: Ints32 | None,
-) -> _Cells:
-    leaves = None
-    if sums is None:
-        leaves = ReturnCells.of(rays, config.leaf_size_m, num_threads)
-        sums = ScanSums.of_cells(rays, leaves, config.leaf_size_m, num_threads, weights)
-    surfels, of_rays = Surfels.of_sums(sums, num_threads), None
-    if by_return and leaves is not None:
-        of_rays = surfels.cells_of_leaves(leaves.keys, num_threads)[leaves.cell_of_ray]
-    elif by_return:
-        of_rays = surfels.cells_at(rays.points, num_threads)
-    return _Cells(surfels, None if config.train else MeanRays.of_sums(sums, num_threads), of_rays)
-
-
-def _returns_to_train(
-    rays: Rays, cells: _Cells, noise: SensorNoise, config: FitConfig, inside: Bools | None, num_threads: int
-) -> SurfaceReturns:
-    """Drop ghosts, found by all rays, and move the other returns towards their surfels."""
-    surfels, true, kept = cells.surfels, None, inside
-    assert cells.of_rays is not None
-    if config.returns.drop_ghosts:
-        true = ~find_ghosts(surfels, rays, cells.of_rays, noise, num_threads)[cells.of_rays]
-        kept = true if inside is None else true & inside
-    if config.returns.onto_planes:
-        rays = onto_surfels(surfels, rays, cells.of_rays, noise, kept, num_threads)
-    elif kept is not None:
-        rays = rays.select(kept)
-    return SurfaceReturns(rays, len(rays), surfels, noise, None, true)
-
-
-def _returns_to_average(
-    rays: Rays, cells: _Cells, noise: SensorNoise, config: FitConfig, inside: Bools | None, num_threads: int
-) -> SurfaceReturns:
-    """Drop ghosts, found by the mean rays of leaf cells."""
-    surfels, means, true, count = cells.surfels, cells.means, None, len(rays)
-    assert means is not None
-    if config.returns.drop_ghosts:
-        cell_of_mean = surfels.cells_of_leaves(means.keys, num_threads)
-        of_ghosts = find_ghosts(surfels, means, cell_of_mean, noise, num_threads)
-        means = means.select(~of_ghosts[cell_of_mean])
-        true = None if cells.of_rays is None else ~of_ghosts[cells.of_rays]
-        count = int(surfels.counts[~of_ghosts].sum() if true is None else np.count_nonzero(true))
-    if inside is not None:
-        count = int(np.count_nonzero(inside if true is None else true & inside))
-        leaves = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
-        means = means.select(leaves.blocks.rows(means.keys, num_threads) >= 0)
-    return SurfaceReturns(rays, count, surfels, noise, means, true)
+            noise = sensor_noise(surfels, rays, cleaning, num_threads)
+        count = len(rays)
+        if cleaning.drop_ghosts:
+            # The mean rays of leaf cells find them for an average, all rays for training.
+            ends = cells if means is None else surfels.cells_of_leaves(means.keys, num_threads)
+            assert ends is not None
+            ghosts = find_ghosts(surfels, rays if means is None else means, ends, noise, num_threads)
+            means = None if means is None else means.select(~ghosts[ends])
+            count = int(surfels.counts[~ghosts].sum())
+            if cells is not None:
+                true = ~ghosts[cells]
+                kept = true if inside is None else true & inside
+        if kept is not None:
+            count = int(np.count_nonzero(kept))
+        if means is not None and inside is not None:
+            own = ReturnCells.of(rays.select(inside), leaf_m, num_threads)
+            means = means.select(own.blocks.rows(means.keys, num_threads) >= 0)
+        elif means is None and cleaning.onto_planes:
+            assert cells is not None
+            rays = onto_surfels(surfels, rays, cells, noise, kept, num_threads)
+        elif means is None and kept is not None:
+            rays = rays.select(kept)
+        return cls(rays, count, surfels, noise, means, true)
 
 
 def occupied_cells(used: SurfaceReturns, config: FitConfig, num_threads: int) -> tuple[Keys, ReturnsOfCells]:
@@ -137,3 +111,73 @@ def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> Keys:
     points, directions, _ = rays.in_c_order()
     cells.insert_along(points, directions, offsets_m, num_threads)
     return cells.sorted_keys(num_threads)
+
+
+BAND_CELLS = 2.0
+"""Reach of the average along a ray, before and behind its return, leaf cells."""
+TRUNCATION_CELLS = 3.0
+"""Truncation distance, and reach of a ray before and behind its return, leaf cells (VDBFusion: 3 voxels). Measured: 4 and 5
+are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real ones."""
+# Weights are rounded to this part of that of a return: sums of integers do not depend on their order.
+_WEIGHT_OF_RETURN = 16
+# Smoothing iterations. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
+# many 0.0 to 0.3 worse.
+_SMOOTHINGS = 24
+CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
+"""Reach of the smoothing in :func:`average_at_corners` along each axis, leaf cells."""
+
+
+@torch.no_grad()
+def average_surface(
+    leaf_keys: Keys,
+    means: MeanRays,
+    returns: ReturnsOfCells,
+    surfels: Surfels,
+    config: FitConfig,
+    num_threads: int,
+) -> GridField:
+    """Compute the smoothed average of the rays' truncated signed distances (Curless and Levoy, 1996).
+
+    `leaf_keys` (C,): of the field, ascending. `means` and `returns` have the same cells, in the same order.
+    """
+    field = GridField(leaf_keys, config.leaf_size_m, num_threads)
+    normals = normals_at(means, surfels, num_threads)
+    distances_m = average_at_corners(field.table, means, returns, normals, config, num_threads)
+    field.distances_m.copy_(torch.from_numpy(distances_m))
+    return field
+
+
+def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> Floats32:
+    """Return the normals (M, 3) of the planes at the ends of rays: of a flat surfel, else towards the sensor."""
+    plane = surfels.flat_planes_of(surfels.cells_of_leaves(rays.keys, num_threads))
+    flat, normals = np.flatnonzero(plane >= 0), -rays.directions
+    normals[flat] = surfels.normals.take(plane.take(flat), axis=0)
+    # A surfel with returns from both sides of a thin wall faces only one side.
+    normals[np.einsum("ij,ij->i", normals, rays.directions) > 0] *= -1
+    return normals
+
+
+def average_at_corners(
+    table: VertexTable,
+    rays: MeanRays,
+    returns: ReturnsOfCells,
+    normals: Floats32,
+    config: FitConfig,
+    num_threads: int,
+) -> Floats32:
+    """Return the smoothed average (V,) of the distances to the planes of rays, at the corners of the cells of `table`, m.
+
+    A ray contributes to the corners of the cells that it crosses, up to `TRUNCATION_CELLS` before and behind its return. Its
+    value there is the distance of the corner to the plane through its return with its normal (M, 3). Smoothing (thin plates)
+    moves the average towards distances that agree with these planes and bend little. Measured: 1.4 points of F-score more
+    than the plain average on simulated scenes, 1.8 on recorded drives; with every sixth scan 3.5 and 0.6.
+
+    Distances depend only on what is within `CELLS_SMOOTHED` of the cells of their rays, to the last bit.
+    """
+    normals = np.ascontiguousarray(normals, np.float32)
+    weights, truncation_m = np.rint(_WEIGHT_OF_RETURN * returns.weights), config.metres(TRUNCATION_CELLS)
+    distances_m, sides = table.average_rays(
+        rays.points, rays.directions, normals, weights, truncation_m, num_threads, _WEIGHT_OF_RETURN
+    )
+    of_rays = rays.points, normals, returns.information, sides
+    return table.smoothed(distances_m, *of_rays, _SMOOTHINGS, num_threads)

@@ -19,8 +19,7 @@ from radarsdf.arrays import Floats, Keys
 from radarsdf.checks import check, check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.fitting.fit import fit
-from radarsdf.fitting.steps import fit_rays
+from radarsdf.fitting.fit import fit, fit_rays
 from radarsdf.live.state import GrowingState
 from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
 from radarsdf.live.tracking import Elsewhere, Follower

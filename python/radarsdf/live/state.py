@@ -15,7 +15,7 @@ from radarsdf._core import QUANTA, GrowingSums, SumsChange
 from radarsdf.arrays import Array, Floats, Keys
 from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.steps import FitInput
+from radarsdf.fitting.fit import FitInput
 from radarsdf.interrupts import at_once
 from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, region_places, regions_of
 from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, rig_of_scans, save_state

@@ -199,7 +199,7 @@ def _in_range(name: str, value: Any, highest: float) -> float:
 
 
 class _Report(TypedDict, total=False):
-    """Schema of the parts of :attr:`Map.report` that other modules read, written by :func:`radarsdf.fitting.steps.fit_rays`."""
+    """Schema of the parts of :attr:`Map.report` that other modules read, written by :func:`radarsdf.fitting.fit.fit_rays`."""
 
     __pydantic_config__ = ConfigDict(strict=True, extra="allow")  # type: ignore[misc]
 

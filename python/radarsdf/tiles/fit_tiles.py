@@ -18,7 +18,7 @@ from tqdm import tqdm
 from radarsdf.checks import AnyPath, check, hides_bar, instance, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.extras import require
-from radarsdf.fitting.steps import FitInput, fit_rays
+from radarsdf.fitting.fit import FitInput, fit_rays
 from radarsdf.io.files import take_lock, write_whole
 from radarsdf.io.read import read
 from radarsdf.returns.intensities import IntensityScale
