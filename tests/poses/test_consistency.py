@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.live.tracking import Lost
+from radarsdf.poses.agreement import sign_significance, turns_fast
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.displacements import Clock, compare_with_poses, contradiction
-from radarsdf.poses.doppler import sign_significance, turns_fast
-from radarsdf.poses.drive import Drive
+from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
 
 from scenes.kinds import KINDS

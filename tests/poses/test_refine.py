@@ -9,11 +9,11 @@ import radarsdf
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.storage import checked_report
+from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.posed import trajectory_report
 from radarsdf.poses.rigid import aligned, turned_by
-from radarsdf.poses.verdict import Verdict
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import Surfels
 from radarsdf.simulate import drifted

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Bools, Ints
-from radarsdf.checking import drift, frames, noise, trajectory
-from radarsdf.checking.doppler import check_doppler
-from radarsdf.checking.intensity import check_intensities
-from radarsdf.checking.mounting import check_mountings, misread_radars
+from radarsdf.checking import frames, noise, trajectory
+from radarsdf.checking.doppler import check_doppler, check_mountings, misread_radars
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
 from radarsdf.checks import are_rigid, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
@@ -113,7 +111,7 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
             trajectory.check_times,
             noise.check_elevation,
             trajectory.check_rounding,
-            check_intensities,
+            noise.check_intensities,
         ):
             found += check_values(recording)
         found += trajectory.check_duplicates(recording, numbers)
@@ -131,7 +129,9 @@ def _sorted(found: list[Finding]) -> list[Finding]:
 
 def _drift(recording: Scans, numbers: Ints, config: FitConfig, found: list[Finding]) -> list[Finding]:
     """Exchanged scans, which refined poses would hide, or drift of the poses or what explains it better."""
-    faults = list(drift.check_order(recording, numbers)) or list(drift.check_drift(recording, config))
+    faults = list(trajectory.check_order(recording, numbers)) or list(
+        trajectory.check_drift(recording, config)
+    )
     unknown = any(finding.name == "motion_undecided" for finding in found)
     return [
         Finding("undecided", "warning", fault.evidence) if unknown and fault.name == "poses_drift" else fault

@@ -13,7 +13,7 @@ from typing_extensions import Self
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.gyroscope import interpolate
+from radarsdf.poses.imu import interpolate
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import skew
 from radarsdf.rig import Rig

@@ -12,6 +12,7 @@ from scipy.stats import t as student
 
 from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.poses.agreement import LEAST_M, Gain, of_neighbours
 from radarsdf.poses.displacements import (
     BY_CHANCE,
     FEWEST_STEPS,
@@ -23,13 +24,12 @@ from radarsdf.poses.displacements import (
     runs_of,
     windows_of,
 )
-from radarsdf.poses.doppler import LEAST_M, NOT_USED, DopplerMotion, SensorVelocities, log_distances
-from radarsdf.poses.drive import Drive, track_once
+from radarsdf.poses.doppler import NOT_USED, DopplerMotion, SensorVelocities
 from radarsdf.poses.planes import plane_cell_m
-from radarsdf.poses.rigid import rotation, steps
-from radarsdf.poses.tracking import Tracker
+from radarsdf.poses.rigid import assembled, rotation, steps
+from radarsdf.poses.tracking import Drive, Tracker, track_once
 
-_PAIRS = 48  # maximum number of pairs of scans to compare
+_SAMPLED, _PAIRS = 100, 48  # returns of a scan, and maximum number of pairs of scans to compare
 _DELAYED = 24  # steps to compare with delayed ones
 _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
 # Prior deviations of velocities, share of the speed: along them, so that returns of most scenes converge from half or twice the true
@@ -189,7 +189,7 @@ class _Pairs:
 
         `yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
         """
-        scales = len(_SCALES)
+        scales, agreement = len(_SCALES), of_neighbours(scans, _SAMPLED)
         gains, losses, moved = [], [], []
         for i in rows.tolist():
             step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
@@ -197,8 +197,9 @@ class _Pairs:
             turns = [motion.steps[i, :3, :3]]
             if yaws is not None and np.isfinite(yaws[i]):
                 turns.append(rotation(np.array([0.0, 0.0, yaws[i]])))
-            turned = [scans[i + 1] @ turn.T for turn in turns]
-            apart = np.min([log_distances(scans[i], scan, shifts_m) for scan in turned], axis=0)
+            both = [assembled(np.tile(turn, (len(shifts_m), 1, 1)), shifts_m) for turn in turns]
+            logs = [agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both]
+            apart = np.min(logs, axis=0)
             ahead, back, still, shifted = np.split(apart, [scales, 2 * scales, 2 * scales + 1])
             gains.append(back - ahead)
             losses.append(shifted - still)
@@ -217,19 +218,19 @@ class _Pairs:
         shares = self.along[np.isfinite(self.along)]
         if len(shares) < FEWEST_STEPS:
             return 0.0, np.inf
-        error = shares.std(ddof=1) / np.sqrt(len(shares))
-        return float(shares.mean()), float(student.ppf(1 - level, len(shares) - 1) * error)
+        mean = Gain.of(shares)
+        return float(mean.mean), float(student.ppf(1 - level, mean.count - 1) * mean.error)
 
     def others(self, level: float) -> Iterator[tuple[float, float]]:
         """Yield the evidence of other motions than that by Doppler, significant above 1, and the ratios of their speeds to its."""
-        yield -float(_significance(self.gains[:, _SAME], level)), -1.0
+        yield -float(Gain.of(self.gains[:, _SAME]).excess(level)), -1.0
         share, limit = self.tracked(level)
         means = self.gains.mean(axis=0)
         best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
         # Of a radar that is too narrow, gains increase up to the end of the scales.
         if best not in (here, 0, len(_SCALES) - 1) and abs(share) + limit >= _SAME_SCALE - 1:
             loss = self.gains[:, best] - self.gains[:, here]
-            yield float(_significance(loss, level / len(_SCALES))), float(_SCALES[best])
+            yield float(Gain.of(loss).excess(level / len(_SCALES))), float(_SCALES[best])
         # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
         other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
         gains = self.gains[np.isfinite(self.along)]
@@ -240,9 +241,9 @@ class _Pairs:
     def farthest(self) -> float:
         """Ratio of speeds to those by Doppler of the most different motion that the returns do not exclude."""
         own = self.gains[:, _SAME]
-        if _significance(own, BY_CHANCE) < 1:
+        if Gain.of(own).excess(BY_CHANCE) < 1:
             return -1.0
-        possible = _SCALES[_significance(own[:, None] - self.gains, BY_CHANCE) <= 1]
+        possible = _SCALES[Gain.of(own[:, None] - self.gains).excess(BY_CHANCE) <= 1]
         share, limit = self.tracked(BY_CHANCE)
         return 1 + min(float(np.abs(possible - 1).max(initial=0)), abs(share) + limit)
 
@@ -254,7 +255,7 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
     contradictions, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
     # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
     moving = pairs.select(~pairs.slow)
-    pattern_moves = len(moving) >= FEWEST_STEPS and _significance(moving.moved, BY_CHANCE) < 1
+    pattern_moves = len(moving) >= FEWEST_STEPS and Gain.of(moving.moved).excess(BY_CHANCE) < 1
     for rows in tried:
         window, first, last = pairs.select(rows), int(scans[rows.start]), int(scans[rows.stop])
         still, moving = window.select(window.slow), window.select(~window.slow)
@@ -267,11 +268,11 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             # After a motion d, log distances after opposite shifts s differ by log((s + d) / (s - d)), about 2 d / s.
             shifts_m = np.linalg.norm(_SHIFTS_M[: opposite.shape[1]], axis=1)
             moved_m = np.abs(opposite.mean(axis=0)) * shifts_m / 2
-            evidence = np.where(moved_m > LEAST_M, np.abs(_significance(opposite, of_each)), 0.0)
+            evidence = np.where(moved_m > LEAST_M, np.abs(Gain.of(opposite).excess(of_each)), 0.0)
             found.append((True, float(evidence.max()), None))
             # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
             if 2 * len(window) >= len(pairs) - 1:
-                found.append((False, 2 - float(_significance(losses, of_each).min()), None))
+                found.append((False, 2 - float(Gain.of(losses).excess(of_each).min()), None))
         if len(moving) >= FEWEST_STEPS:
             found += [(True, *other) for other in moving.others(level)]
             if abs(moving.farthest - 1) > _MEASURED:
@@ -281,9 +282,3 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
                 contradictions.append((confirmed, excess, OtherMotion(first, last, ratio, confirmed)))
     clearest = max(contradictions, key=lambda one: one[:2])[2] if contradictions else None
     return clearest, tuple(doubts)
-
-
-def _significance(samples: Floats, level: float) -> Floats:
-    """Return the means of K samples (K, ...) over the least that is significant at a level (Student's t)."""
-    errors = samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
-    return samples.mean(axis=0) / np.maximum(errors, 1e-9) / student.ppf(1 - level, len(samples) - 1)

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.stats import t as student
 
 from radarsdf.arrays import Bools, Floats, Ints
-from radarsdf.poses.doppler import ERRORS, DopplerMotion, SensorVelocities
+from radarsdf.poses.agreement import ERRORS
+from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.rigid import steps
 
 BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
 from radarsdf.poses.motion import KnownMotion, spans_of, turned_halfway, usual_duration_s, way
-from radarsdf.poses.rigid import rotation, rotation_vector, step_vectors, steps
+from radarsdf.poses.rigid import rotation_vector, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import (
     MIN_DOPPLER_RETURNS,
@@ -22,20 +20,6 @@ from radarsdf.returns.moving import (
     sensor_velocities,
 )
 
-_SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
-_FEW_SAMPLED = 100  # returns of a scan, where many pairs are compared
-_FIRST_PAIRS = 12
-_FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
-YAW_STEP_RAD = 0.07
-"""Resolution of the yaws between neighbouring scans."""
-_TURNS_RAD = YAW_STEP_RAD * np.arange(-6, 7)
-_TURNS, _HALF_TURNS = (rotation(np.multiply.outer(share * _TURNS_RAD, [0.0, 0.0, 1.0])) for share in (1, 0.5))
-CLEAR = 4.0
-"""Standard errors by which scans must agree better with one sign of the Doppler."""
-LEAST_M = 0.05
-"""Minimum distance between returns that counts, m, below the noise of any radar."""
-ERRORS = 3.0
-"""Standard errors of a significant difference."""
 # Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
 # elevations with a common error.
 LEAST_MPS = 0.02
@@ -226,89 +210,3 @@ class DopplerMotion(KnownMotion):
             for jacobian in both:
                 jacobian[:, :3] -= levers @ jacobian[:, 3:]
         return both
-
-
-class _Pair:
-    """Two scans, whose returns are compared with the nearest one of the other."""
-
-    def __init__(self, first: Floats, second: Floats, sampled: int = _SAMPLED) -> None:
-        self._trees = cKDTree(first), cKDTree(second)
-        self._sampled = [scan[:: max(1, len(scan) // sampled)] for scan in (first, second)]
-
-    def log_distances(self, turn: Floats, shifts_m: Floats) -> Floats:
-        """Return log distances (K, M) to the nearest returns, if the second scan is turned by (3, 3) and shifted by (K, 3)."""
-        # Queries are turned back, since trees are dearer.
-        first, second = self._sampled
-        of_second = self._trees[0].query(second @ turn.T + shifts_m[:, None])[0]
-        of_first = self._trees[1].query((first - shifts_m[:, None]) @ turn)[0]
-        return np.log(np.maximum(np.concatenate([of_second, of_first], axis=1), LEAST_M))
-
-
-def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
-    """Return mean log distances (K,) to the nearest returns of scans in common axes, the second after shifts (K, 3)."""
-    return _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), shifts_m).mean(axis=1)
-
-
-def sign_significance(
-    scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats
-) -> tuple[float, Floats]:
-    """Return the standard errors by which scans agree better with velocities than reversed, and the yaws (2, F - 1) for both."""
-    durations_s = np.diff(times_s)
-    moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
-    usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
-    usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
-    # The longest steps are most informative: if the first are twice as clear as needed, the others are not compared, unless
-    # the sensor turns so fast that each yaw is needed.
-    pairs = sorted(np.flatnonzero(usable).tolist(), key=lambda i: -float(moved_m[i] @ moved_m[i]))
-    yaws = np.full((2, len(durations_s)), np.nan)
-    gains, significance = [], 0.0
-    for some in (pairs[:_FIRST_PAIRS], pairs[_FIRST_PAIRS:_PAIRS], pairs[_PAIRS:]):
-        for i in some:
-            gain, yaws[:, i] = _reversal_gains(scans[i], scans[i + 1], moved_m[i])
-            gains.append(gain)
-        significance = _significance(gains) if gains else 0.0
-        clear = abs(significance) > 2 * CLEAR or len(gains) >= min(_PAIRS, len(pairs))
-        if clear and not turns_fast(yaws[int(significance < 0)]):
-            break
-    return significance, yaws
-
-
-def turns_fast(yaws: Floats) -> bool:
-    """Return whether yaws (F - 1,) between scans, NaN if unknown, are beyond those that tracking expects of an unknown sensor."""
-    known = np.abs(yaws[np.isfinite(yaws)])
-    return bool(len(known) and np.median(known) > YAW_STEP_RAD)
-
-
-def _significance(gains: Sequence[Floats]) -> float:
-    """Return the mean gain of pairs of scans, from those of their returns, in standard errors."""
-    means = np.array([gain.mean() for gain in gains])
-    if len(gains) < _FEW_PAIRS:
-        # Returns of both scans count, mostly on the same objects: half of them are independent.
-        variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
-    else:
-        variance = means.var(ddof=1) / len(gains)
-    return float(means.mean() / np.sqrt(max(variance, 1e-12)))
-
-
-def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Iterable[Floats]) -> float:
-    """Return by how many standard errors pairs of scans agree better after `motions` (4, 4) than after their rotations alone."""
-    # Negative where a pattern that moves with the sensor, such as that of a straight wall, explains the returns better.
-    gains = [
-        _Pair(first, second).log_distances(motion[:3, :3], np.outer([0.0, 1.0], motion[:3, 3])).mean(axis=1)
-        for (first, second), motion in zip(pairs, motions, strict=True)
-        if min(len(first), len(second)) > 0
-    ]
-    if len(gains) < _FEW_PAIRS:
-        return 0.0
-    still, moved = np.transpose(gains)
-    return float((still - moved).mean() / max((still - moved).std(ddof=1) / np.sqrt(len(gains)), 1e-6))
-
-
-def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> tuple[Floats, tuple[float, float]]:
-    """Return how much nearer each return (M,) is after this motion than after its reverse, each with its best yaw, and these."""
-    pair, both = _Pair(first, second), []
-    for whole, half in zip(_TURNS, _HALF_TURNS, strict=True):
-        both.append(pair.log_distances(whole, np.multiply.outer([1.0, -1.0], half @ moved_m)))
-    ahead, back = np.swapaxes(both, 0, 1)
-    i, j = int(ahead.mean(axis=1).argmin()), int(back.mean(axis=1).argmin())
-    return back[j] - ahead[i], (float(_TURNS_RAD[i]), float(_TURNS_RAD[j]))

@@ -15,11 +15,10 @@ from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.body import MeasuredScans, join_radars
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.odometry import odometry
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.refine import FIRST_SIGMAS
+from radarsdf.poses.refine import FIRST_SIGMAS, PosesEstimate
 from radarsdf.poses.rigid import aligned
 from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
 from radarsdf.scans import Scans

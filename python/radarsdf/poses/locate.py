@@ -16,14 +16,12 @@ from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.map.map import Map
-from radarsdf.poses.drive import Drive
-from radarsdf.poses.estimate import WEAK, PosesEstimate
 from radarsdf.poses.odometry import track_scans
-from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.registration import PlaneMap, thin
+from radarsdf.poses.planes import PlaneMap, SensorReturns, plane_cell_m, thin
+from radarsdf.poses.refine import WEAK, PosesEstimate
 from radarsdf.poses.rigid import covariance_in, increments, skew, transform
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near, search_scans
-from radarsdf.poses.tracking import Tracked
+from radarsdf.poses.tracking import Drive, Tracked
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.scans import Scans

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radarsdf.arrays import Floats, Ints
+from radarsdf.poses.agreement import NEIGHBOURS, Verdict, density, median_apart_m
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.verdict import NEIGHBOURS, Verdict, density, median_apart_m
 from radarsdf.returns.noise import SensorNoise
 
 _MOST_RETURNS = 50_000  # maximum number of returns compared

@@ -15,18 +15,17 @@ from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
+from radarsdf.poses.agreement import CLEAR, ERRORS, motion_significance, sign_significance, turns_fast
 from radarsdf.poses.body import BodyVelocities, MeasuredScans, join_radars
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance, turns_fast
-from radarsdf.poses.drive import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
-from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.gyroscope import UnusableGyroscopeError
-from radarsdf.poses.imu import Inertial, level_poses
+from radarsdf.poses.doppler import NOT_USED
+from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
+from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import steps
-from radarsdf.poses.tracking import Tracked
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, Tracked, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
@@ -304,8 +303,7 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
     if drive.velocities is None:
         within = np.flatnonzero(np.diff([found.segment for found in tracked]) == 0)
         motions = steps(np.stack([found.pose for found in tracked]))[within]
-        pairs = [(drive.scans[i], drive.scans[i + 1]) for i in within]
-        if (significance := motion_significance(pairs, motions)) < -ERRORS:
+        if (significance := motion_significance(drive.scans, within, motions)) < -ERRORS:
             refuse("moved", "scans agree better without any motion", doppler)
         if significance < ERRORS:
             what = "neighbouring scans agree as well without any motion"
