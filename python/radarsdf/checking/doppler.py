@@ -11,7 +11,7 @@ from radarsdf.checking.recording import Finding, ascending_times_s, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Agreement, Gain, choose_pairs
 from radarsdf.poses.calibrate import calibrate
-from radarsdf.poses.displacements import compare_with_poses, contradiction
+from radarsdf.poses.consistency import Consistency, contradiction
 from radarsdf.poses.doppler import LEAST_MPS, NoVelocityError, SensorVelocities, radial_offset_mps
 from radarsdf.poses.rigid import increments, rotation, step_vectors
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
@@ -128,11 +128,11 @@ def _compared_in_block(recording: Scans, times_s: Floats, sign: float, *, known:
     if offset_mps := radial_offset_mps(points, speeds, velocities):
         evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
         yield Finding("doppler_offset", "warning", evidence)
-    contradicted, clock = compare_with_poses(velocities, times_s[rows], recording.poses[rows])
-    if contradicted is not None and not known:
-        yield _contradiction(contradicted)
-    if contradicted is None and clock.note:
-        yield Finding("times_uneven", "warning", clock.note[0])
+    tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
+    if tested.contradiction is not None and not known:
+        yield _contradiction(tested.contradiction)
+    if tested.contradiction is None and tested.clock is not None and tested.clock.note:
+        yield Finding("times_uneven", "warning", tested.clock.note[0])
 
 
 def _contradiction(words: str) -> Finding:

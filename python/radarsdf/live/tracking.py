@@ -16,9 +16,15 @@ from radarsdf.arrays import Floats
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog, rig_of_scans
 from radarsdf.poses.agreement import CLEAR, ERRORS, sign_significance, turns_fast
-from radarsdf.poses.body import BodyVelocities
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
+from radarsdf.poses.doppler import (
+    LEAST_MPS,
+    NOT_USED,
+    BodyVelocities,
+    NoVelocityError,
+    SensorVelocities,
+    upright,
+)
 from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation_vector

@@ -25,7 +25,6 @@ from radarsdf.arrays import Floats, Ints, Ints32
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
-from radarsdf.poses.agreement import CLEAR, sign_significance
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import LEAST_MPS, SensorVelocities
 from radarsdf.poses.imu import Inertial
@@ -422,19 +421,17 @@ def _measure(scans: Scans, rig: Rig, times_s: Floats) -> _Measured:
     covariance = np.tile(_ANY_MPS2 * np.eye(3), (len(times_s), 1, 1))
     for label, rows in rig.scans_of_radars().items():
         own = [scans.points[i] for i in rows]
-        checked = CheckedScans.of(own, chosen(scans.doppler_mps, rows), times_s[rows])
+        checked = CheckedScans.of(own, chosen(scans.doppler_mps, rows), times_s[rows]).signed()
         notes += [f"{label}: {note}" for note in checked.notes]
         for i, scan in zip(rows, checked.scans, strict=True):
             points[i] = scan
-        if checked.velocities is None or checked.times_s is None:
+        if checked.velocities is None:
             continue
-        significance = sign_significance(checked.scans, checked.velocities, checked.times_s)[0]
-        sign = -1 if significance < -CLEAR else 1
-        velocities[label] = checked.velocities.scaled(sign)
+        velocities[label] = checked.velocities
         # Those of single scans have no prior of the vertical: a sensor may be mounted in any direction.
         for i, velocity in zip(rows, checked.velocities.of_scans, strict=True):
             if velocity.found:
-                mean[i], covariance[i] = sign * velocity.velocity_mps, velocity.covariance
+                mean[i], covariance[i] = checked.sign * velocity.velocity_mps, velocity.covariance
     least = np.full((len(mean), 3), LEAST_MPS)
     least[:, 2] = np.hypot(LEAST_MPS, PRIOR[-1] * np.linalg.norm(mean, axis=1))
     information = np.linalg.inv(covariance + least[:, :, None] ** 2 * np.eye(3))

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from radarsdf.arrays import Floats, Ints
 from radarsdf.imu import Imu
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.motion import MotionRate, usual_duration_s
+from radarsdf.poses.motion import MotionRate, interpolate, usual_duration_s
 from radarsdf.poses.rigid import covariance_in, nearest_rotation, rotation, rotation_vector
 
 # Prior bias and noise, of cheap gyroscopes, until they are estimated from the drive.
@@ -61,11 +61,6 @@ def cumulate_turns(turns: Floats) -> Floats:
 def integrate_rates(times_s: Floats, rates: Floats) -> Floats:
     """Return the rotations (G, 3, 3) to the first frame, from rates (G, 3), rad/s, by the trapezoidal rule."""
     return cumulate_turns(0.5 * (rates[1:] + rates[:-1]) * np.diff(times_s)[:, None])
-
-
-def interpolate(times_s: Floats, at_s: Floats, values: Floats) -> Floats:
-    """Interpolate values (G, 3) at ascending times (G,) linearly at `times_s` (F,)."""
-    return np.stack([np.interp(times_s, at_s, column) for column in values.T], 1)
 
 
 @dataclass(frozen=True)

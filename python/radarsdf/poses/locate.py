@@ -121,14 +121,14 @@ def locate(
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     start = None if guess is None else check_pose(guess, "guess")
     with ThreadPool(config.num_threads) as pool:
-        drive, tracked, *_, notes = track_scans(
+        drive, tracked, *_, checked = track_scans(
             points, doppler_mps, times_s, imu, config, pool.num_threads, progress
         )
         count = len(tracked)
         poses, covariance = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
         explained, segments = np.full(count, np.nan), np.full(count, -1)
         why: list[Lost] = []
-        localiser = _Localiser(index, drive, tracked, config, pool.num_threads, notes)
+        localiser = _Localiser(index, drive, tracked, config, pool.num_threads, checked.notes)
         of_scans = np.array([found.segment for found in tracked])
         parts = [np.flatnonzero(of_scans == segment) for segment in range(of_scans[-1] + 1)]
         while parts:
@@ -150,7 +150,7 @@ def locate(
         "verdict": _summarize(segments, explained),
         "found": int((segments >= 0).sum()),
         "lost": [str(each) for each in why],
-        "notes": notes,
+        "notes": checked.notes,
         "seconds": time.perf_counter() - begin,
     }
     return Localisation(poses, covariance, explained, segments, report)

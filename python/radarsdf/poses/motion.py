@@ -329,3 +329,8 @@ def usual_duration_s(durations_s: Floats) -> float:
     """Return the median of those durations that are positive: radars of a rig may measure at once. 0 if there are none."""
     positive = durations_s[durations_s > 0]
     return float(np.median(positive)) if len(positive) else 0.0
+
+
+def interpolate(times_s: Floats, at_s: Floats, values: Floats) -> Floats:
+    """Interpolate values (G, 3) at ascending times (G,) linearly at `times_s` (F,)."""
+    return np.stack([np.interp(times_s, at_s, column) for column in values.T], 1)

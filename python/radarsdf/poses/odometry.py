@@ -15,11 +15,10 @@ from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
-from radarsdf.poses.agreement import CLEAR, ERRORS, motion_significance, sign_significance, turns_fast
-from radarsdf.poses.body import BodyVelocities, MeasuredScans, join_radars
-from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.agreement import ERRORS, motion_significance
+from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.doppler import NOT_USED
+from radarsdf.poses.doppler import NOT_USED, BodyVelocities
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
@@ -124,16 +123,19 @@ def odometry(
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     with ThreadPool(config.num_threads) as pool:
-        drive, tracked, compared, inertial, notes = track_scans(
+        drive, tracked, compared, inertial, scans = track_scans(
             points, doppler_mps, times_s, imu, config, pool.num_threads, progress
         )
-        velocities = drive.velocities
+        velocities, notes = drive.velocities, scans.notes
         notes += _check_observed(tracked, drive, notes)
         segments = np.array([found.segment for found in tracked])
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
         if velocities is not None:
-            covariance = widened(compared, poses, covariance, segments, drive)
+            known = [(each.rows, tested) for each, tested in compared if each.velocities is not None]
+            # Radars of a rig move together: the best known one decides.
+            rows, least = min(known, key=lambda radar: len(radar[1].doubts or ()))
+            covariance = least.widened(rows, poses, covariance, segments, drive)
         if inertial.alignment is not None:
             poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -144,11 +146,11 @@ def odometry(
         "length_m": length_m,
         "segments": int(segments[-1]) + 1,
         "doppler": velocities is not None,
-        "doppler_sign": compared[0].sign,
+        "doppler_sign": scans.sign,
         "gyroscope": gyroscope is not None,
         "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
-        "moving": sum(each.moving for each in compared),
+        "moving": scans.moving,
         "notes": notes,
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
@@ -161,9 +163,9 @@ class TrackedScans(NamedTuple):
 
     drive: Drive
     tracked: list[Tracked]
-    compared: list[ComparedRadar]
+    compared: list[tuple[CheckedScans, Consistency]]  # of each radar
     inertial: Inertial
-    notes: list[str]
+    scans: CheckedScans  # of all radars
 
 
 def track_scans(
@@ -177,81 +179,45 @@ def track_scans(
 ) -> TrackedScans:
     """Check scans, compare their Doppler with their returns, and track them. Arguments and errors are those of :func:`odometry`."""
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
-    for _, checked in radars:
+    for checked in radars:
         if checked.times_s is None:
             msg = "times_s are missing: the time of each scan, s"
             raise ValueError(msg)
         checked.check_intervals()
     if imu is None and isinstance(points, Scans):
         imu = points.imu
-    compared = [_compare_doppler(rows, checked, config, num_threads) for rows, checked in radars]
-    _, scans, times, velocities = join_radars(rig, [each.measured for each in compared])
+    compared = [_compare_doppler(checked.signed(), config, num_threads) for checked in radars]
+    scans = join_radars(rig, [each for each, _ in compared])
+    times, velocities = scans.times_s, scans.velocities
     assert times is not None
-    notes = [note for each in compared for note in each.notes]
     # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
-    of_radars = [each.measured.rows for each in compared if each.measured.velocities is not None]
+    of_radars = [each.rows for each, _ in compared if each.velocities is not None]
     radar = max(of_radars, key=len, default=np.arange(len(times)))
     own = None if velocities is None else velocities.select(radar)
-    inertial = Inertial.of(imu, own, times, radars[0][1].begin_s, radar)
-    yaws = compared[0].yaws if rig is None else None
-    drive = Drive(scans, times, velocities, inertial.gyroscope, yaws=yaws, rig=rig)
+    inertial = Inertial.of(imu, own, times, scans.begin_s, radar)
+    drive = Drive(scans.scans, times, velocities, inertial.gyroscope, yaws=scans.yaws, rig=rig)
     try:
         drive, tracked = track_drive(drive, config, num_threads, progress)
     except UnusableGyroscopeError as why:
         inertial = inertial.without(why)
         drive = dataclasses.replace(drive, gyroscope=None)
         drive, tracked = track_drive(drive, config, num_threads, progress)
-    return TrackedScans(drive, tracked, compared, inertial, [*notes, *inertial.notes])
+    scans.notes.extend(inertial.notes)
+    return TrackedScans(drive, tracked, compared, inertial, scans)
 
 
-class ComparedRadar(NamedTuple):
-    """A radar, whose Doppler was compared with its returns."""
-
-    measured: MeasuredScans
-    yaws: Floats | None  # see :class:`Drive`
-    sign: int
-    consistency: Consistency
-    moving: int  # number of moving returns left out
-    notes: list[str]
-
-
-def widened(
-    compared: Sequence[ComparedRadar], poses: Floats, covariance: Floats, segments: Ints, drive: Drive
-) -> Floats:
-    """Widen covariances (F, 6, 6) of poses by what Doppler and returns leave open."""
-    known = [each.consistency for each in compared if each.measured.velocities is not None]
-    # Radars of a rig move together: the best known one decides.
-    least = min(known, key=lambda one: len(one.doubts or ()))
-    return least.widened(poses, covariance, segments, drive)
-
-
-def _compare_doppler(rows: Ints, checked: CheckedScans, config: FitConfig, num_threads: int) -> ComparedRadar:
-    times_s, velocities, sign, yaws = checked.times_s, checked.velocities, 1, None
-    assert times_s is not None
-    if velocities is not None:
-        significance, both = sign_significance(checked.scans, velocities, times_s)
-        if significance < -CLEAR:
-            sign, both, velocities = -1, both[::-1], velocities.scaled(-1.0)
-        yaws = both if turns_fast(both[0]) else None
-    limits, notes = config.returns, [*checked.notes]
+def _compare_doppler(
+    checked: CheckedScans, config: FitConfig, num_threads: int
+) -> tuple[CheckedScans, Consistency]:
+    """Compare the Doppler of a radar with its returns within the ranges of the settings."""
+    limits = config.returns
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-    drive = Drive(scans, times_s, velocities, None, yaws=yaws)
-    consistency = Consistency.of_returns(drive, config, num_threads)
-    if velocities is not None:
-        velocities, tested = consistency.applied(velocities)
-        notes += tested
-        if velocities is not None and (clock := consistency.clock) is not None:
-            times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
-            velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
-    measured = MeasuredScans(rows, scans, times_s, velocities)
-    return ComparedRadar(
-        measured,
-        None if velocities is None else yaws,
-        sign,
-        consistency.of_scans(rows),
-        checked.moving,
-        notes,
-    )
+    checked = dataclasses.replace(checked, scans=scans)
+    if checked.velocities is None or checked.times_s is None:
+        return checked, Consistency()
+    drive = Drive(scans, checked.times_s, checked.velocities, None, yaws=checked.yaws)
+    tested = Consistency.of_returns(drive, config, num_threads)
+    return tested.corrected(checked), tested
 
 
 def _estimate_jointly(

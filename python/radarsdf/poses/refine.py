@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import Floats
 from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.agreement import Verdict, held_out
-from radarsdf.poses.body import MeasuredScans, join_radars
-from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.displacements import compare_with_poses
-from radarsdf.poses.doppler import NOT_USED, DopplerMotion
+from radarsdf.poses.checked_scans import CheckedScans, join_radars
+from radarsdf.poses.consistency import Consistency
+from radarsdf.poses.doppler import DopplerMotion
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, plane_cell_m
@@ -238,10 +237,9 @@ def refine_poses(
     if poses is None:
         raise ValueError(MISSING_POSES)
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
-    notes = [note for _, checked in radars for note in checked.notes]
-    given, rigid = usable_poses(poses, sum(len(rows) for rows, _ in radars))
-    compared = [_compare_doppler(rows, checked, given, rig, notes) for rows, checked in radars]
-    _, scans, times, velocities = join_radars(rig, compared)
+    given, rigid = usable_poses(poses, sum(len(checked.rows) for checked in radars))
+    joined = join_radars(rig, [_compare_doppler(checked, given, rig) for checked in radars])
+    scans, times, velocities, notes = joined.scans, joined.times_s, joined.velocities, joined.notes
     if not rigid.all():
         notes += LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes
         scans = [scan if usable else scan[:0] for scan, usable in zip(scans, rigid, strict=True)]
@@ -272,7 +270,7 @@ def refine_poses(
         "bias": found.motions[0].bias.tolist(),
         **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
-        "moving": sum(checked.moving for _, checked in radars),
+        "moving": joined.moving,
         "rounds": found.rounds,
         "seconds": time.perf_counter() - begin,
     }
@@ -285,20 +283,13 @@ def refine_poses(
     return RefinedPoses(given, found.covariance + np.einsum("fi,fj->fij", off, off), False, report)
 
 
-def _compare_doppler(
-    rows: Ints, checked: CheckedScans, given: Floats, rig: Rig | None, notes: list[str]
-) -> MeasuredScans:
-    """Compare the Doppler of a radar with the given poses (F, 4, 4); add notes."""
-    scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
-    if velocities is None or times_s is None or len(rows) < 2:
-        return MeasuredScans(rows, scans, times_s, None)
-    poses = given if rig is None else rig.sensor_poses(given)[rows]
-    if (velocities.mean_mps[:-1] * steps(poses)[:, :3, 3]).sum() < 0:
-        velocities = velocities.scaled(-1.0)
-    contradicted, clock = compare_with_poses(velocities, times_s, poses)
-    notes += clock.note
-    if contradicted is not None:
-        notes.append(f"{NOT_USED}: {contradicted}. If it is right, leave the poses out: radarsdf.odometry")
-        return MeasuredScans(rows, scans, times_s, None)
-    velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
-    return MeasuredScans(rows, scans, times_s - clock.errors_s, velocities)
+def _compare_doppler(checked: CheckedScans, given: Floats, rig: Rig | None) -> CheckedScans:
+    """Compare the Doppler of a radar with the given poses (F, 4, 4) of all scans."""
+    if checked.velocities is None or checked.times_s is None or len(checked.rows) < 2:
+        return dataclasses.replace(checked, velocities=None)
+    poses = given if rig is None else rig.sensor_poses(given)[checked.rows]
+    if (checked.velocities.mean_mps[:-1] * steps(poses)[:, :3, 3]).sum() < 0:
+        checked = dataclasses.replace(checked, velocities=checked.velocities.scaled(-1.0))
+    assert checked.velocities is not None
+    assert checked.times_s is not None
+    return Consistency.of_poses(checked.velocities, checked.times_s, poses).corrected(checked)

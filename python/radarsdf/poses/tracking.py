@@ -16,8 +16,7 @@ from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.agreement import YAW_STEP_RAD
-from radarsdf.poses.body import BodyVelocities
-from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
+from radarsdf.poses.doppler import BodyVelocities, DopplerMotion, SensorVelocities
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import (
     Motion,
