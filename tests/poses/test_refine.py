@@ -11,7 +11,7 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.storage import checked_report
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.loops import open_loops
-from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, unbiased_normals
+from radarsdf.poses.planes import SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.posed import trajectory_report
 from radarsdf.poses.rigid import aligned, turned_by
 from radarsdf.returns.noise import SensorNoise
@@ -295,7 +295,7 @@ def test_scans_that_move_together_cost_nothing():
     poses[:, 0, 3] = [0, 0.5, 1.2]
     scans = [np.column_stack([rng.uniform(2, 9, (3000, 2)), rng.normal(-1, 0.05, 3000)]) for _ in poses]
     returns = SensorReturns.of(scans, 0.0, None)
-    planes, _ = common_planes(returns, poses, PlaneGrid(3, False, 0.4), None, ReturnsConfig(), 1)
+    planes, _ = common_planes(returns, poses, 3, 0.4, None, ReturnsConfig(), 1)
     weak = np.tile(np.eye(6), (3, 1, 1))
     pull = np.zeros((3, 6))
     for k, direction in enumerate(np.eye(3)):
@@ -319,7 +319,7 @@ def test_a_noisy_scan_has_an_unbiased_height(height_m):
         for noise_m in noises_m
     ]
     returns = SensorReturns.of(scans, 0.0, None)
-    planes, _ = common_planes(returns, poses, PlaneGrid(10, False, 0.4), None, ReturnsConfig(), 1)
+    planes, _ = common_planes(returns, poses, 10, 0.4, None, ReturnsConfig(), 1)
     weak = np.tile(np.eye(6), (10, 1, 1))
     moved = planes.solve(weak, np.zeros((9, 6, 6)), np.zeros((10, 6)), 1e-6, 100, False, 1)[0][:, 2]
     assert (

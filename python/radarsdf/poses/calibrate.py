@@ -11,8 +11,9 @@ and the returns of all radars lie on common planes, whose offsets and tilts are 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -370,72 +371,55 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     if scans.times_s is None:
         msg = "times_s are missing: the time of each scan, s"
         raise ValueError(msg)
-    scans = scans.select(np.argsort(scans.times_s, kind="stable"))
-    rig, times_s = scans.rig, scans.times_s
-    assert rig is not None
-    assert times_s is not None
+    order = np.argsort(scans.times_s, kind="stable")
+    scans, rig, times_s = scans.select(order), rig.select(order), scans.times_s[order]
     labels, reference, mountings = rig.labels, int(rig.of_scan[0]), rig.T_body_sensor
     if mountings is None:
         mountings = np.tile(np.eye(4), (len(labels), 1, 1))
     imu = scans.imu if imu is None else imu
     if imu is not None and imu.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=mountings[reference, :3, :3].T @ imu.R_sensor_imu)
-    measured = _measure(scans, rig, times_s)
+    radars = [radar.signed() for radar in CheckedScans.of_radars(scans, None, None, mounted=False)[1]]
+    of_radars = {labels[rig.of_scan[radar.rows[0]]]: radar for radar in radars}
+    notes = [f"{label}: {note}" for label, radar in of_radars.items() for note in radar.notes]
+    static = {i: scan for radar in radars for i, scan in zip(radar.rows.tolist(), radar.scans, strict=True)}
+    mean_mps, whitening = _velocities(radars, len(times_s))
     first = np.flatnonzero(rig.of_scan == reference)
     at_s, path, given, on_path = _body_path(scans, first, mountings[reference], imu, config)
     interval_s = float(np.median(np.diff(times_s[first])))
     begin_s, end_s = _turning_part(at_s, path, _MOST_KNOTS * interval_s)
     kept = np.flatnonzero((times_s >= begin_s) & (times_s <= end_s))
-    points, of_scan = [measured.points[i] for i in kept], rig.of_scan[kept]
+    points, of_scan = [static[i] for i in kept.tolist()], rig.of_scan[kept]
     returns = SensorReturns.of(points, limits.min_range_m, limits.max_range_m, Rig(labels, of_scan, None))
-    velocities = measured.mean_mps[kept], measured.whitening[kept]
-    cell_m = plane_cell_m(points, config.leaf_size_m)
-    radars = RadarsOfBody(of_scan, times_s[kept] - begin_s, returns, *velocities, cell_m, reference)
+    cell_m, velocities = plane_cell_m(points, config.leaf_size_m), (mean_mps[kept], whitening[kept])
+    measured = RadarsOfBody(of_scan, times_s[kept] - begin_s, returns, *velocities, cell_m, reference)
     body = BodyPath.of(at_s - begin_s, path, end_s - begin_s, interval_s, mountings)
     steps = None
     if given:
         rows = (at_s >= begin_s) & (at_s <= end_s)
         motion = Motion.of(path[rows], *unsteadiness(path[rows], at_s[rows]), at_s[rows])
         steps = motion, at_s[rows] - begin_s
-    body, covariance = estimate_mountings(body, radars, steps, config)
+    body, covariance = estimate_mountings(body, measured, steps, config)
     each = zip(mountings, body.mountings, covariance, body.late_s, strict=True)
     found = {label: Mounting.of(*own) for label, own in zip(labels, each, strict=True)}
-    own = measured.velocities.get(labels[reference])
+    own = of_radars[labels[reference]].velocities
     of_imu, on_imu = _imu_mounting(imu, own, times_s[first], mountings[reference])
-    return Calibration(found, of_imu, str(labels[reference]), [*measured.notes, *on_path, *on_imu])
+    return Calibration(found, of_imu, str(labels[reference]), [*notes, *on_path, *on_imu])
 
 
-class _Measured(NamedTuple):
-    """Returns and Doppler velocities of F scans."""
-
-    points: list[Floats]  # (N_i, 3) static returns
-    mean_mps: Floats  # (F, 3) velocities in the sensor frame
-    whitening: Floats  # (F, 3, 3) of these
-    velocities: dict[Label, SensorVelocities]
-    notes: list[str]
-
-
-def _measure(scans: Scans, rig: Rig, times_s: Floats) -> _Measured:
-    points, mean = list(scans.points), np.zeros((len(times_s), 3))
-    notes, velocities = list[str](), dict[Label, SensorVelocities]()
-    covariance = np.tile(_ANY_MPS2 * np.eye(3), (len(times_s), 1, 1))
-    for label, rows in rig.scans_of_radars().items():
-        own = [scans.points[i] for i in rows]
-        checked = CheckedScans.of(own, chosen(scans.doppler_mps, rows), times_s[rows]).signed()
-        notes += [f"{label}: {note}" for note in checked.notes]
-        for i, scan in zip(rows, checked.scans, strict=True):
-            points[i] = scan
-        if checked.velocities is None:
-            continue
-        velocities[label] = checked.velocities
+def _velocities(radars: Sequence[CheckedScans], count: int) -> tuple[Floats, Floats]:
+    """Return velocities by Doppler (F, 3) of `count` scans in their sensor frames, and matrices (F, 3, 3) that whiten them."""
+    mean, covariance = np.zeros((count, 3)), np.tile(_ANY_MPS2 * np.eye(3), (count, 1, 1))
+    for radar in radars:
         # Those of single scans have no prior of the vertical: a sensor may be mounted in any direction.
-        for i, velocity in zip(rows, checked.velocities.of_scans, strict=True):
+        each = () if radar.velocities is None else radar.velocities.of_scans
+        for i, velocity in zip(radar.rows, each, strict=False):
             if velocity.found:
-                mean[i], covariance[i] = checked.sign * velocity.velocity_mps, velocity.covariance
-    least = np.full((len(mean), 3), LEAST_MPS)
+                mean[i], covariance[i] = radar.sign * velocity.velocity_mps, velocity.covariance
+    least = np.full((count, 3), LEAST_MPS)
     least[:, 2] = np.hypot(LEAST_MPS, PRIOR[-1] * np.linalg.norm(mean, axis=1))
     information = np.linalg.inv(covariance + least[:, :, None] ** 2 * np.eye(3))
-    return _Measured(points, mean, np.linalg.cholesky(information).swapaxes(1, 2), velocities, notes)
+    return mean, np.linalg.cholesky(information).swapaxes(1, 2)
 
 
 def _body_path(

@@ -87,13 +87,21 @@ class CheckedScans:
 
     @classmethod
     def of_radars(
-        cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None
+        cls,
+        points: _Points,
+        doppler_mps: Sequence[ArrayLike] | None,
+        times: ArrayLike | None,
+        *,
+        mounted: bool = True,
     ) -> tuple[Rig | None, list[CheckedScans]]:
-        """:meth:`of` for each radar, and the rig if there are several."""
+        """:meth:`of` for each radar, and the rig if there are several, whose mountings must be known if `mounted`."""
         rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)
         if rig is None:
             return None, [cls.of(points, doppler_mps, times)]
-        check(rig.T_body_sensor is not None, "T_body_sensor is missing: the mounting of each radar")
+        check(
+            not mounted or rig.T_body_sensor is not None,
+            "T_body_sensor is missing: the mounting of each radar",
+        )
         times_s = None if times_ is None else _checked_times(times_, len(given))
         radars = []
         for rows in rig.scans_of_radars().values():

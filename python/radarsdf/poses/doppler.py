@@ -16,7 +16,6 @@ from radarsdf.poses.motion import (
     MotionRate,
     interpolate,
     spans_of,
-    turned_halfway,
     usual_duration_s,
     way,
 )
@@ -209,9 +208,7 @@ class DopplerMotion(KnownMotion):
         between, (begin, end, levers) = self.steps.copy(), self.velocities.of_steps
         between[:, :3, :3] = rotations
         turns = rotation_vector(rotations, self.turns)
-        between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None])
-        if levers is not None:
-            between[:, :3, 3] += turned_halfway(turns, np.einsum("fij,fj->fi", levers, turns))
+        between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None], levers)
         return dataclasses.replace(self, steps=between)
 
     def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:

@@ -89,17 +89,21 @@ class MotionRate:
 Priors = tuple[MotionPrior, MotionPrior]  # translation, rotation
 
 
-def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats) -> Floats:
+def way(
+    turn: Floats,
+    begin_mps: Floats,
+    end_mps: Floats,
+    duration_s: float | Floats,
+    levers: Floats | None = None,
+) -> Floats:
     """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
-    and linearly changing velocity."""
-    middle = turned_halfway(turn, 0.5 * (begin_mps + end_mps))
-    end = np.einsum("...ij,...j->...i", rotation(turn), end_mps)
-    return duration_s / 6 * (begin_mps + 4 * middle + end)
+    and linearly changing velocity. `levers` (..., 3, 3): its derivative by the turn, if radars have lever arms, m."""
 
+    def turned(share: float, vectors: Floats) -> Floats:
+        return np.einsum("...ij,...j->...i", rotation(share * turn), vectors)
 
-def turned_halfway(turn: Floats, vectors: Floats) -> Floats:
-    """Rotate vectors (..., 3) of the middle of a step to its beginning."""
-    return np.einsum("...ij,...j->...i", rotation(0.5 * turn), vectors)
+    moved = duration_s / 6 * (begin_mps + 4 * turned(0.5, 0.5 * (begin_mps + end_mps)) + turned(1.0, end_mps))
+    return moved if levers is None else moved + turned(0.5, np.einsum("...ij,...j->...i", levers, turn))
 
 
 @dataclass(frozen=True)
@@ -117,10 +121,7 @@ class PredictedStep:
     def pose(self, turn: Floats | None = None) -> Floats:
         """Return the pose (..., 4, 4) after rotation vectors `turn` (..., 3). None: the predicted one."""
         turn = self.turn.mean if turn is None else turn
-        found = transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s))
-        if self.lever is not None:
-            found[..., :3, 3] += turned_halfway(turn, np.einsum("ij,...j->...i", self.lever, turn))
-        return found
+        return transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s, self.lever))
 
     def covariance(self, turn: Floats | None = None) -> Floats:
         """Return the covariance (6, 6) of translation and rotation vector, in the first frame, correlated by the turn."""

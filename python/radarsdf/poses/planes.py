@@ -139,35 +139,32 @@ class SensorReturns:
         return replace(rays, sensor_of_scan=self.rig.of_scan, num_sensors=len(self.rig.labels))
 
 
-@dataclass(frozen=True)
-class PlaneGrid:
-    """Grouping of returns into planes."""
-
-    window: int  # number of consecutive scans that share planes
-    shifted: bool  # whether windows are shifted by half
-    cell_m: float  # edge of the cell of a plane
-
-
 def common_planes(
     returns: SensorReturns,
     poses: Floats,
-    grid: PlaneGrid,
+    window: int,
+    cell_m: float,
     noise: SensorNoise | None,
     config: ReturnsConfig,
     num_threads: int = 0,
+    *,
+    shifted: bool = False,
 ) -> tuple[CommonPlanes, SensorNoise]:
-    """Build the normal equations of poses (F, 4, 4) from common planes, and the noise of the sensor, estimated unless given."""
+    """Build the normal equations of poses (F, 4, 4) from common planes, and the noise of the sensor, estimated unless given.
+
+    The planes, in cells of `cell_m`, are those of windows of consecutive scans, which may be shifted by half of one.
+    """
     rays = returns.posed(poses)
     planes = np.full(len(rays), -1, np.int32)
     centres, normals, noises, total = [], [], [], 0
-    begin = -(grid.window // 2) if grid.shifted and grid.window < len(poses) else 0
-    for k in range(begin, len(poses), grid.window):
-        low, high = max(0, k), min(len(poses), k + grid.window)
+    begin = -(window // 2) if shifted and window < len(poses) else 0
+    for k in range(begin, len(poses), window):
+        low, high = max(0, k), min(len(poses), k + window)
         if high - low < 2:
             continue
         rows = slice(*np.searchsorted(rays.scans, [low, high]).tolist())
         part = rays.select(rows)
-        surfels = Surfels.of(part, grid.cell_m / LEAVES_PER_SURFEL, num_threads)
+        surfels = Surfels.of(part, cell_m / LEAVES_PER_SURFEL, num_threads)
         found = planes_of(part.points, surfels, num_threads)
         planes[rows] = np.where(found >= 0, found + np.int32(total), np.int32(-1))
         centres.append(surfels.centres)
@@ -179,10 +176,8 @@ def common_planes(
     of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, planes
     of_scans = poses[:, :3, 3] - rays.origin, rays.up_of_scan
     of_planes = np.concatenate(centres), np.ascontiguousarray(np.concatenate(normals))
-    extent_m, together = grid.cell_m, min(grid.window, _TOGETHER)
-    noise_of_scan = known.of_scans(rays)
-    common = CommonPlanes(*of_rays, *of_scans, *of_planes, extent_m, noise_of_scan, together, num_threads)
-    return common, known
+    together = min(window, _TOGETHER), num_threads
+    return CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, known.of_scans(rays), *together), known
 
 
 def planes_of(points: Floats32, surfels: Surfels, num_threads: int) -> Ints32:

@@ -22,7 +22,7 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import DopplerMotion
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
-from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, plane_cell_m
+from radarsdf.poses.planes import SensorReturns, common_planes, plane_cell_m
 from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut
@@ -83,10 +83,10 @@ class PosesEstimate:
         rounds = 0
         for window, planned in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
             cells = max(planned, finest)
-            grid = PlaneGrid(window, rounds % 2 == 1, cells * cell_m)
             # The noise is estimated every other round: it changes slowly.
-            known = None if rounds % 2 == 0 else noise
-            planes, noise = common_planes(returns, poses, grid, known, config, num_threads)
+            odd = rounds % 2 == 1
+            grid = window, cells * cell_m, noise if odd else None
+            planes, noise = common_planes(returns, poses, *grid, config, num_threads, shifted=odd)
             steps, inverse, inverse_below, decrement = planes.solve(
                 *_prior(motions, poses, anchor), _TOLERANCE, _MOST_ITERATIONS, True, num_threads
             )
