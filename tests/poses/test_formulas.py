@@ -21,6 +21,7 @@ from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, upright
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
+from radarsdf.poses.odometry import PosedScans, pose_sigmas
 from radarsdf.poses.planes import (
     PlaneMap,
     SensorReturns,
@@ -30,7 +31,6 @@ from radarsdf.poses.planes import (
     reduction,
     thin,
 )
-from radarsdf.poses.posed import PosedScans, pose_sigmas
 from radarsdf.poses.refine import _by_biases
 from radarsdf.poses.rigid import (
     aligned,

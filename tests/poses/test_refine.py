@@ -11,8 +11,8 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.storage import checked_report
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.loops import open_loops
+from radarsdf.poses.odometry import trajectory_report
 from radarsdf.poses.planes import SensorReturns, common_planes, unbiased_normals
-from radarsdf.poses.posed import trajectory_report
 from radarsdf.poses.rigid import aligned, turned_by
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import Surfels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -76,18 +77,19 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
     by_poses = velocity_of_poses(recording.poses, knots)[scans]
     used = (scans > 0) & (scans < len(recording) - 1)
     used &= (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
-    if used.sum() < _MIN_SCANS:
-        if times is not None:
-            yield from _compared_speeds(recording, scans, by_poses, by_doppler)
-        return
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (by_doppler[used], by_poses[used]))
-    cosine = float(np.median(np.einsum("na,na->n", a, b)))
+    moves = used.sum() >= _MIN_SCANS
+    cosine = float(np.median(np.einsum("na,na->n", a, b))) if moves else 1.0
     sign = -1.0 if cosine < -0.8 else 1.0
     if times is not None:
-        found = list(_compared_speeds(recording, scans, by_poses, sign * by_doppler))
-        yield from found
-        yield from _compared_in_block(recording, times, sign, known=bool(found))
-    if cosine < -0.8:
+        inner = (scans > 0) & (scans < len(recording) - 1)
+        variances, edges = np.full(int(inner.sum()), LEAST_MPS**2), np.append(scans[inner], scans[inner][-1:])
+        found = contradiction(by_poses[inner], sign * by_doppler[inner], variances, edges)
+        wrong = None if found is None else found.words("the poses")
+        yield from _compared_in_block(recording, times, sign, wrong)
+    if not moves:
+        return
+    if sign < 0:
         # Sign conventions differ, and moving returns are found with either: so this is not a fault of the data.
         evidence = f"By its Doppler the sensor moves backwards where its poses move forwards (median cosine {cosine:.2f})."
         yield Finding("doppler_sign", "note", evidence)
@@ -102,41 +104,28 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
         yield Finding("sensor_turned", "warning", evidence)
 
 
-def _compared_speeds(
-    recording: Scans, scans: Ints, by_poses: Floats, by_doppler: Floats
+def _compared_in_block(
+    recording: Scans, times_s: Floats, sign: float, wrong: str | None
 ) -> Iterator[Finding]:
-    """Compare velocities (K, 3) of scans (K,), sensor frame, m/s, by window."""
-    used = (scans > 0) & (scans < len(recording) - 1)
-    variances = np.full(int(used.sum()), LEAST_MPS**2)
-    scans = np.append(scans[used], scans[used][-1:])
-    found = contradiction(by_poses[used], by_doppler[used], variances, scans)
-    if found is not None:
-        yield _contradiction(found.words("the poses"))
+    """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone.
 
-
-def _compared_in_block(recording: Scans, times_s: Floats, sign: float, *, known: bool) -> Iterator[Finding]:
-    """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone."""
-    assert recording.doppler_mps is not None
+    `wrong`: what contradicts the Doppler of all scans.
+    """
     begin = max(0, (len(recording) - _BLOCK) // 2)
     rows = slice(begin, begin + _BLOCK)
     points = [np.asarray(scan, np.float64) for scan in recording.points[rows]]
-    speeds = [sign * np.asarray(values, np.float64) for values in recording.doppler_mps[rows]]
-    try:
+    speeds = [sign * np.asarray(values, np.float64) for values in (recording.doppler_mps or [])[rows]]
+    with contextlib.suppress(NoVelocityError):
         velocities = SensorVelocities.of(points, speeds, times_s[rows])
-    except NoVelocityError:
-        return
-    if offset_mps := radial_offset_mps(points, speeds, velocities):
-        evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
-        yield Finding("doppler_offset", "warning", evidence)
-    tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
-    if tested.contradiction is not None and not known:
-        yield _contradiction(tested.contradiction)
-    if tested.contradiction is None and tested.clock is not None and tested.clock.note:
-        yield Finding("times_uneven", "warning", tested.clock.note[0])
-
-
-def _contradiction(words: str) -> Finding:
-    return Finding("doppler_contradicts_poses", "warning", f"{words[0].upper()}{words[1:]}.")
+        if offset_mps := radial_offset_mps(points, speeds, velocities):
+            evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
+            yield Finding("doppler_offset", "warning", evidence)
+        tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
+        wrong = wrong or tested.contradiction
+        if tested.contradiction is None and tested.clock is not None and tested.clock.note:
+            yield Finding("times_uneven", "warning", tested.clock.note[0])
+    if wrong is not None:
+        yield Finding("doppler_contradicts_poses", "warning", f"{wrong[0].upper()}{wrong[1:]}.")
 
 
 def velocity_of_poses(T_world_sensor: Floats, times_s: Floats) -> Floats:

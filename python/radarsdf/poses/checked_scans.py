@@ -66,21 +66,22 @@ class CheckedScans:
             times_s, repeated = spread_times(times_s - begin_s)
             if repeated:
                 notes = [*notes, f"{repeated} scans repeat the previous time: they are spread evenly."]
+        unused = cls(rows, scans, times_s, begin_s, None, 0, notes)
         if doppler_mps is None or times_s is None:
-            return cls(rows, scans, times_s, begin_s, None, 0, notes)
+            return unused
         speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
         notes = notes if filler is None else [*notes, f"{filler}."]
         try:
             velocities = SensorVelocities.of(scans, speeds, times_s)
         except NoVelocityError as why:
-            return cls(rows, scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {why}."])
+            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
         if velocities.climb_assumed:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
         if offset_mps := radial_offset_mps(scans, speeds, velocities):
-            offset = f"{offset_mps:.2f} m/s are added to that of all returns"
-            return cls(rows, scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {offset}."])
+            why = f"{offset_mps:.2f} m/s are added to that of all returns"
+            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
         moving = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
         return cls(rows, standing, times_s, begin_s, velocities, moving, notes)

@@ -197,8 +197,8 @@ class DopplerMotion(KnownMotion):
         spans = spans_of(times_s, len(times_s))
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
-        unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
-        return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
+        measured = velocities, durations_s, turns
+        return cls(steps(poses), shares, spans, *measured, bias_sigma=common).at(poses)
 
     def at(self, poses: Floats) -> DopplerMotion:
         return self.turned(steps(poses)[:, :3, :3])

@@ -17,7 +17,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.map.map import Map
 from radarsdf.poses.odometry import track_scans
-from radarsdf.poses.planes import PlaneMap, SensorReturns, plane_cell_m, thin
+from radarsdf.poses.planes import PlaneMap, SensorReturns, least_certain, plane_cell_m, thin
 from radarsdf.poses.refine import WEAK, PosesEstimate
 from radarsdf.poses.rigid import covariance_in, increments, skew, transform
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near, search_scans
@@ -262,7 +262,7 @@ class _Localiser:
                 points, mean = thin(np.concatenate(near)), correction @ own
                 registered = planes.fit(points, mean, prior)
                 # Along the least certain axis, a step by chance is discounted as its information is.
-                axis, pose = registered.least_certain, registered.pose.copy()
+                axis, pose = least_certain(registered.covariance), registered.pose.copy()
                 pose[:3, 3] -= (1 - registered.observed[0]) * (axis @ (pose - mean)[:3, 3]) * axis
                 both = np.stack([mean, pose])
                 agreeing = planes.fine.scores(points, both, planes.variances).mean(axis=1).tolist()

@@ -179,10 +179,12 @@ class Motion:
     """Motions between neighbouring scans measured by one source: given poses, Doppler, or a gyroscope."""
 
     steps: Floats  # (F - 1, 4, 4)
-    bias: Floats  # (6,) bias of a step: translation, m, rotation vector, rad, in the sensor frame
-    variances: Floats  # (2,) of a component of a step's translation, m², and rotation, rad², at share 1
-    shares: Floats  # (F - 1, 6) factors of these variances. Infinite for components that are not measured
+    shares: Floats  # (F - 1, 6) factors of the variances. Infinite for components that are not measured
     spans: Floats  # (F - 1,) duration of each step relative to the median, to which biases are proportional
+    # (2,) of a component of a step's translation, m², and rotation, rad², at share 1
+    variances: Floats = field(default_factory=lambda: np.ones(2), kw_only=True)
+    # (6,) bias of a step: translation, m, rotation vector, rad, in the sensor frame
+    bias: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
     # (6,) standard deviation of the systematic part of the bias, not observable from this source.
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
 
@@ -192,7 +194,7 @@ class Motion:
         spans = spans_of(times_s, len(poses))
         shares = np.repeat(spans[:, None], 6, axis=1)
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
-        return cls(steps(poses), np.zeros(6), variances, shares, spans)
+        return cls(steps(poses), shares, spans, variances=variances)
 
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
         """Relinearise at poses (F, 4, 4). Most measurements do not depend on them."""
@@ -282,8 +284,7 @@ class SteadyMotion(KnownMotion):
         spans = spans_of(times_s, len(times_s))
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
-        unknown = np.zeros(6), np.ones(2), shares, spans
-        return cls(steps(poses), *unknown, priors, duration_s * spans, duration_s**2 * usual).at(poses)
+        return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 
     def at(self, poses: Floats) -> SteadyMotion:
         """Predict each step of `poses` from its neighbours."""
@@ -299,7 +300,9 @@ class SteadyMotion(KnownMotion):
     def evidence(self) -> Motion:
         """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""
         shares = np.where(np.isinf(self.shares), np.inf, self.spans[:, None])
-        return Motion(self.steps, self.bias, self.usual, shares, self.spans, bias_sigma=self.bias_sigma)
+        return Motion(
+            self.steps, shares, self.spans, variances=self.usual, bias=self.bias, bias_sigma=self.bias_sigma
+        )
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:

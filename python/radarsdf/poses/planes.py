@@ -204,20 +204,17 @@ _SHIFTS = 0.0, 1.0, -1.0, 2.0, -2.0  # cells, beyond the extent of single object
 _SURE = 0.05  # standard deviation of a translation of the prior that needs no returns, cells
 
 
-@dataclass(frozen=True)
-class Registered:
-    """Pose of a registered scan."""
+@dataclass
+class Tracked:
+    """Scan registered with planes, and its place in a tracked drive."""
 
-    pose: Floats  # (4, 4) T_world_sensor
-    covariance: Floats  # (6, 6) translation, m, rotation vector, rad, world axes
-    agreeing: float  # share of inliers on the planes, in [0, 1]
-    # Share of the variance of the prior that the returns removed, of translation and rotation, in the least certain direction.
-    observed: tuple[float, float]
-
-    @property
-    def least_certain(self) -> Floats:
-        """(3,) axis of the least certain translation."""
-        return _least_certain(self.covariance)
+    pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
+    covariance: Floats  # (6, 6) of the step to this scan: translation, m, rotation vector, rad, world axes
+    agreeing: float  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
+    segment: int  # number of its segment of the drive
+    turn: Floats  # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn
+    # Share of the predicted variance that the returns removed, of translation and rotation, in the least certain direction.
+    observed: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass
@@ -245,7 +242,7 @@ class PlaneMap:
         *equations, inliers = self.fine.agreement(scan, pose, self.variances)
         return *_discount_tilts(*equations), inliers
 
-    def fit(self, scan: Floats, mean: Floats, prior: Floats, start: Floats | None = None) -> Registered:
+    def fit(self, scan: Floats, mean: Floats, prior: Floats, start: Floats | None = None) -> Tracked:
         """Fit the pose of a scan (N, 3), sensor frame, m, coarse to fine, given that of the prior and its covariance (6, 6)."""
         prior = prior + _LEAST_VARIANCE * np.eye(6)
         information, pose = np.linalg.inv(prior), mean if start is None else start
@@ -262,13 +259,13 @@ class PlaneMap:
         covariance = self._discount_chance(scan, pose, prior, np.linalg.inv(total))
         moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
         observed = moved_share, _removed_share(prior[3:, 3:], covariance[3:, 3:])
-        return Registered(pose, covariance, inliers / len(scan), observed)
+        return Tracked(pose, covariance, inliers / len(scan), 0, np.zeros(3), observed)
 
     def _discount_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
         """Remove the spurious information along the least certain axis that returns have for any shift of the scan."""
         # In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance.
         cell_m = _CELLS[-1] * self.cell_size_m
-        axis = _least_certain(covariance)
+        axis = least_certain(covariance)
         before, left = (float(axis @ each[:3, :3] @ axis) for each in (prior, covariance))
         if before < (_SURE * cell_m) ** 2:
             return covariance
@@ -299,7 +296,8 @@ class PlaneMap:
         return min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
 
 
-def _least_certain(covariance: Floats) -> Floats:
+def least_certain(covariance: Floats) -> Floats:
+    """Return the axis (3,) of the least certain translation of a covariance (6, 6)."""
     return np.linalg.eigh(covariance[:3, :3])[1][:, -1]
 
 

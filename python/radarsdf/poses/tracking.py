@@ -27,7 +27,7 @@ from radarsdf.poses.motion import (
     SteadyMotion,
     usual_duration_s,
 )
-from radarsdf.poses.planes import PlaneMap, SensorReturns, apart_m, plane_cell_m, thin
+from radarsdf.poses.planes import PlaneMap, SensorReturns, Tracked, apart_m, plane_cell_m, thin
 from radarsdf.poses.rigid import covariance_in, rotation, rotation_vector
 from radarsdf.returns.noise import sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
@@ -47,19 +47,6 @@ _UNRELATED = 500  # poses, for the agreement by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at an accepted pose
 _MOST_RADII = 10.0  # maximum standard deviation of a predicted translation, median ranges: beyond, candidates miss the overlap
 _MOST_RECKONED_M = 1e4  # and for a segment to begin at the dead-reckoned pose: over a day, that is useless
-
-
-@dataclass
-class Tracked:
-    """Tracked scan."""
-
-    pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
-    covariance: Floats  # (6, 6) of the step to this scan: translation, m, rotation vector, rad, world axes
-    agreeing: float  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
-    segment: int  # number of its segment of the drive
-    turn: Floats  # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn
-    # Share of the predicted variance that the returns removed, of translation and rotation, in the least certain direction.
-    observed: tuple[float, float] = (0.0, 0.0)
 
 
 def begin_segment(pose: Floats, segment: int = 0) -> Tracked:
@@ -141,7 +128,7 @@ class Tracker:
         last_R, mean = self.last.pose[:3, :3], self.last.pose @ predicted.pose(turn)
         found = self._planes.fit(scan, mean, covariance_in(predicted.covariance(turn), last_R), start)
         turn = rotation_vector(last_R.T @ found.pose[:3, :3], turn)
-        return Tracked(found.pose, found.covariance, found.agreeing, self.last.segment, turn, found.observed)
+        return dataclasses.replace(found, segment=self.last.segment, turn=turn)
 
     def _search_pose(
         self, scan: Floats, predicted: PredictedStep, capture_m: float, radius_m: float
