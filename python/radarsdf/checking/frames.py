@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -185,16 +184,15 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
     moved = [(scan - T[:3, 3]) @ T[:3, :3] for scan, T in zip(given, recording.poses[rows], strict=True)]
     first, second = np.searchsorted(rows, pairs.T)
     significances = []
-    for of_scan in (functools.partial(np.median, axis=0), _mean_direction):
-        before, after = (np.array([of_scan(scan) for scan in scans]) for scans in (given, moved))
+    both = [
+        [(x, x / np.maximum(np.linalg.norm(x, axis=1), 1e-12)[:, None]) for x in of] for of in (given, moved)
+    ]
+    for k, middle in enumerate((np.median, np.mean)):
+        before, after = (np.array([middle(scan[k], axis=0) for scan in scans]) for scans in both)
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
         significances.append(Gain.of(steadier).significance)
     return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
-
-
-def _mean_direction(scan: Floats) -> Floats:
-    return (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)
 
 
 _UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}
@@ -243,8 +241,10 @@ def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) ->
     rotations_by_90 = Rotation.create_group("O").as_matrix().round()
     # All permutations and reflections of axes but the identity.
     for matrix in sorted([*rotations_by_90, *-rotations_by_90], key=_surprise)[1:]:
-        words, kind = _written(matrix), _kind(matrix)
-        camera = kind == "camera_frame"
+        words = _written(matrix)
+        mirrored = np.array_equal(np.abs(matrix), np.eye(3)) and np.linalg.det(matrix) < 0
+        camera = any(np.array_equal(matrix, m) for m in (_CAMERA_OF_RADAR, _CAMERA_OF_RADAR.T))
+        kind = "camera_frame" if camera else "mirrored" if mirrored else "axes_swapped"
         # z up or down, x and y in any order; and the camera frame
         if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
             continue
@@ -287,14 +287,6 @@ def _surprise(matrix: Floats) -> tuple[bool, bool, float]:
     """Sort key of matrices: the identity first, then those that keep z up, a more common mistake, then few signs."""
     key = matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum())
     return not np.array_equal(matrix, np.eye(3)), *key
-
-
-def _kind(matrix: Floats) -> str:
-    """Name of the finding for axes that must be mapped by this matrix."""
-    if any(np.array_equal(matrix, m) for m in (_CAMERA_OF_RADAR, _CAMERA_OF_RADAR.T)):
-        return "camera_frame"
-    keeps_axes = np.array_equal(np.abs(matrix), np.eye(3))
-    return "mirrored" if keeps_axes and np.linalg.det(matrix) < 0 else "axes_swapped"
 
 
 def _angles(poses: Floats) -> Iterator[tuple[str, Rotation]]:

@@ -19,7 +19,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import LAGS, MIN_RETURNS, Agreement, Gain, relative
 from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.refine import refine_poses
-from radarsdf.poses.rigid import nearest_rotation, step_vectors, transform
+from radarsdf.poses.rigid import lengths_of_steps_m, nearest_rotation, step_vectors, transform
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.scans import Scans
 
@@ -72,7 +72,7 @@ def check_lengths(recording: Scans) -> Iterator[Finding]:
         evidence = f"Half of the returns are {range_m:.4g} m or more from the sensor."
         yield Finding("units", "error" if error else "warning", evidence)
     elif times is not None and len(recording) > 2:
-        speed = float(np.median(_steps_m(recording) / np.diff(times)))
+        speed = float(np.median(lengths_of_steps_m(recording.poses) / np.diff(times)))
         if speed > _FAST_MPS:
             yield Finding("units", "error", f"By its poses, the sensor moves at {speed:.4g} m/s.")
 
@@ -105,7 +105,7 @@ def check_duplicates(recording: Scans, numbers: Ints) -> Iterator[Finding]:
         yield Finding("duplicate_scans", "warning", evidence)
     same_pose = (recording.poses[1:] == recording.poses[:-1]).all(axis=(1, 2))
     same_pose[[later - 1 for earlier, later in repeated if later == earlier + 1]] = False
-    lengths = _steps_m(recording)
+    lengths = lengths_of_steps_m(recording.poses)
     if len(recording) < 3 or not same_pose.any() or same_pose.all():
         return
     # A stationary sensor has equal poses too. One whose poses are held catches up with a leap.
@@ -190,11 +190,6 @@ def _agree_without(
     return False
 
 
-def _steps_m(recording: Scans) -> Floats:
-    """(F - 1,) lengths of the steps between poses."""
-    return np.linalg.norm(np.diff(recording.poses[:, :3, 3], axis=0), axis=1)
-
-
 # Sizes of a sample of windows, scans and returns, evenly spread, so that a large recording takes no longer than a small one.
 _WINDOWS, _SCANS, _RETURNS = 3, 60, 60_000
 _LEAST_SCANS = 4
@@ -242,7 +237,9 @@ def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
                 improved.append(report)
                 lever_m = np.repeat([1.0, range_m], 3)
                 given, found = (step_vectors(poses) * lever_m for poses in (recording.poses, refined.poses))
-                shares.append(_excess_of_few_steps(found - given[begin : begin + len(found)]))
+                off_m2 = np.sort(((found - given[begin : begin + len(found)]) ** 2).sum(axis=1))
+                # Of the four largest errors of steps, over that of exponentially distributed ones.
+                shares.append(off_m2[-4:].sum() / off_m2.sum() * len(off_m2) / (4 * np.log(len(off_m2))))
                 faults += [*_time_offsets(given, found, begin), *_mountings(given, found, begin)]
     if improved:
         best = max(improved, key=lambda report: float(report["gain"] / report["gain_error"]))
@@ -312,12 +309,6 @@ def _mountings(given: Floats, refined: Floats, begin: int) -> Iterator[tuple[flo
             f"likelihood ratio to drift: {ratio:.0f})."
         )
         yield float(ratio), Finding("sensor_turned", "warning", evidence)
-
-
-def _excess_of_few_steps(errors: Floats) -> float:
-    """Share of the four largest squared errors (K, 6) of steps, over that of exponentially distributed ones."""
-    off_m2 = np.sort((errors**2).sum(axis=1))
-    return float(off_m2[-4:].sum() / off_m2.sum() * len(off_m2) / (4 * np.log(len(off_m2))))
 
 
 def check_order(recording: Scans, numbers: Ints) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -212,7 +213,12 @@ def sign_significance(
             best = logs.mean(axis=2).argmin(axis=1)
             yaws[:, i] = _TURNS_RAD[best]
             gains.append(logs[1, best[1]] - logs[0, best[0]])
-        significance = _significance(gains) if gains else 0.0
+        mean = Gain.of(np.array([gain.mean() for gain in gains]), 1e-6) if gains else Gain(0.0, 1.0, 0)
+        if len(gains) < _FEW_PAIRS:
+            # Returns of both scans count, mostly on the same objects: half of them are independent.
+            variance = sum(2 * gain.var() / len(gain) for gain in gains) / max(len(gains), 1) ** 2
+            mean = dataclasses.replace(mean, error=np.sqrt(max(variance, 1e-12)))
+        significance = float(mean.significance)
         clear = abs(significance) > 2 * CLEAR or len(gains) >= min(_PAIRS, len(pairs))
         if clear and not turns_fast(yaws[int(significance < 0)]):
             break
@@ -223,16 +229,6 @@ def turns_fast(yaws: Floats) -> bool:
     """Return whether yaws (F - 1,) between scans, NaN if unknown, are beyond those that tracking expects of an unknown sensor."""
     known = np.abs(yaws[np.isfinite(yaws)])
     return bool(len(known) and np.median(known) > YAW_STEP_RAD)
-
-
-def _significance(gains: Sequence[Floats]) -> float:
-    """Return the mean gain of pairs of scans, from those of their returns, in standard errors."""
-    mean = Gain.of(np.array([gain.mean() for gain in gains]), 1e-6)
-    if len(gains) >= _FEW_PAIRS:
-        return float(mean.significance)
-    # Returns of both scans count, mostly on the same objects: half of them are independent.
-    variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
-    return float(mean.mean / np.sqrt(max(variance, 1e-12)))
 
 
 def motion_significance(scans: Sequence[Floats], firsts: Ints, steps: Floats) -> float:

@@ -387,7 +387,11 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     first = np.flatnonzero(rig.of_scan == reference)
     at_s, path, given, on_path = _body_path(scans, first, mountings[reference], imu, config)
     interval_s = float(np.median(np.diff(times_s[first])))
-    begin_s, end_s = _turning_part(at_s, path, _MOST_KNOTS * interval_s)
+    # The part that turns most.
+    turned = np.append(0.0, np.cumsum(np.linalg.norm(step_vectors(path)[:, 3:], axis=1)))
+    last = np.searchsorted(at_s, at_s + _MOST_KNOTS * interval_s, side="right") - 1
+    begin = int(np.argmax(turned[last] - turned))
+    begin_s, end_s = at_s[[begin, last[begin]]].tolist()
     kept = np.flatnonzero((times_s >= begin_s) & (times_s <= end_s))
     points, of_scan = [static[i] for i in kept.tolist()], rig.of_scan[kept]
     returns = SensorReturns.of(points, limits.min_range_m, limits.max_range_m, Rig(labels, of_scan, None))
@@ -439,14 +443,6 @@ def _body_path(
         path = found.poses[part] @ np.linalg.inv(T_body_sensor)
     rising = np.append(True, np.diff(times_s) > 0)
     return times_s[rising], path[rising], given, notes
-
-
-def _turning_part(times_s: Floats, poses: Floats, most_s: float) -> tuple[float, float]:
-    """Return begin and end of the part of at most `most_s` in which poses (F, 4, 4) turn most."""
-    turned = np.append(0.0, np.cumsum(np.linalg.norm(step_vectors(poses)[:, 3:], axis=1)))
-    last = np.searchsorted(times_s, times_s + most_s, side="right") - 1
-    begin = int(np.argmax(turned[last] - turned))
-    return float(times_s[begin]), float(times_s[last[begin]])
 
 
 def _imu_mounting(

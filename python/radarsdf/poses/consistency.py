@@ -80,10 +80,8 @@ def contradiction(
         if information < 3 * ERRORS**2 * len(shown):
             continue
         along = np.einsum("ki,ki->k", shown - doppler, longer) / np.maximum(lengths, 1e-9)
-        total = (weights * lengths).sum()
-        share = float((weights * along).sum() / total)
-        spread = weights * (along - share * lengths)
-        error = float(np.sqrt((spread**2).sum() * len(shown) / (len(shown) - 1)) / total)
+        root = np.sqrt(weights / np.maximum(lengths, 1e-9))
+        share, error, _ = _slope(root * lengths, root * along)
         needed = student.ppf(1 - BY_CHANCE / (2 * len(tried)), len(shown) - 1) * error
         if abs(share) <= max(needed, ERRORS / np.sqrt(information)) + _SAME_SPEED:
             continue
@@ -261,8 +259,8 @@ class Consistency:
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads)
         yaws = drive.yaws if every == 1 else None
         tracked, _ = track_once(Drive(scans, times_s, free, None, yaws=yaws), tracker)
-        seen = np.array([len(scan) > 0 for scan in scans])
-        usable = (np.diff(runs_of(times_s)) == 0) & seen[1:] & seen[:-1]
+        filled = np.array([len(scan) > 0 for scan in scans])
+        usable = (np.diff(runs_of(times_s)) == 0) & filled[1:] & filled[:-1]
         if usable.sum() < FEWEST_STEPS:
             return cls()
         followed = usable & (np.diff([found.segment for found in tracked]) == 0)
@@ -271,7 +269,12 @@ class Consistency:
         own, shown, axes = motion.steps[:, :3, 3], steps(poses)[:, :3, 3], poses[:-1, :3, :3]
         in_world = np.stack([found.covariance[:3, :3] for found in tracked[1:]])
         covariance = np.einsum("fji,fjk,fkl->fil", axes, in_world, axes)  # of `shown`, m²
-        along = np.where(followed, _relative_differences(shown, covariance, motion, free), np.nan)
+        # Differences relative to the Doppler, without the share of the prior. NaN where returns hardly observe them.
+        before = free.step_covariances(motion.durations_s)
+        left, prior = (np.einsum("ki,kij,kj->k", own, each, own) for each in (covariance, before))
+        seen = 1 - left / np.maximum(prior, 1e-30)
+        along = np.einsum("ki,ki->k", shown - own, own) / np.maximum((own**2).sum(axis=1), 1e-12)
+        along = np.where(followed & (seen > _LEAST_SEEN), along / np.maximum(seen, _LEAST_SEEN), np.nan)
         rows_of_pairs = np.flatnonzero(usable)  # also where tracking was lost: by wrong Doppler, it may be
         rows_of_pairs = rows_of_pairs[:: -(-len(rows_of_pairs) // _PAIRS)]
         pairs = _Pairs.of(scans, motion, along, rows_of_pairs, None if yaws is None else yaws[1])
@@ -281,8 +284,7 @@ class Consistency:
             lengths_m, count = np.linalg.norm(own, axis=1) * usable, min(_DELAYED, len(usable))
             begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
             fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
-            before = free.step_covariances(motion.durations_s).diagonal(axis1=1, axis2=2)
-            seen = (1 - covariance.diagonal(axis1=1, axis2=2) / before).clip(0, 1)
+            seen = (1 - np.divide(*(of.diagonal(axis1=1, axis2=2) for of in (covariance, before)))).clip(0, 1)
             runs = runs_of(drive.times_s)
             delay, possible = delay_of(velocities, runs, rows, motion, shown, covariance, seen, fastest)
         shown = own * (1 + np.nan_to_num(along)[:, None])
@@ -350,19 +352,6 @@ class Consistency:
             velocities = dataclasses.replace(velocities, clock_sigma_s=self.clock.sigma_s)
         notes = [*checked.notes, *notes]
         return dataclasses.replace(checked, times_s=times_s, velocities=velocities, notes=notes, yaws=yaws)
-
-
-def _relative_differences(
-    shown: Floats, covariance: Floats, motion: DopplerMotion, prior: SensorVelocities
-) -> Floats:
-    """Return differences (F - 1,) of tracked steps from those by Doppler, relative to these; NaN where returns hardly observe them."""
-    own = motion.steps[:, :3, 3]
-    along = np.einsum("ki,ki->k", shown - own, own) / np.maximum((own**2).sum(axis=1), 1e-12)
-    before = np.einsum("ki,kij,kj->k", own, prior.step_covariances(motion.durations_s), own)
-    left = np.einsum("ki,kij,kj->k", own, covariance, own)
-    seen = 1 - left / np.maximum(before, 1e-30)
-    # Without the share of the prior.
-    return np.where(seen > _LEAST_SEEN, along / np.maximum(seen, _LEAST_SEEN), np.nan)
 
 
 @dataclass(frozen=True)

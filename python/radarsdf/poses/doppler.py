@@ -11,14 +11,7 @@ import numpy as np
 from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
-from radarsdf.poses.motion import (
-    KnownMotion,
-    MotionRate,
-    interpolate,
-    spans_of,
-    usual_duration_s,
-    way,
-)
+from radarsdf.poses.motion import KnownMotion, MotionRate, interpolate, spans_of, usual_duration_s, way
 from radarsdf.poses.rigid import rotation_vector, skew, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import (

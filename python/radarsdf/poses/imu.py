@@ -202,6 +202,12 @@ class ImuAlignment:
     up: Floats  # (F, 3) unit vectors in the frame of the radar at each scan
 
     @property
+    def report(self) -> dict[str, Any]:
+        """Entry of the report of the poses."""
+        keys = ("R_sensor_imu", "sigma_rad", "time_offset_s", "lever_m")
+        return {key: np.asarray(getattr(self, key)).tolist() for key in keys}
+
+    @property
     def words(self) -> str:
         how = f"found to {np.degrees(self.sigma_rad):.1f} degrees" if self.sigma_rad > 0 else "given"
         return f"The IMU's axes were {how}, scans are {self.time_offset_s:.3f} s late in its clock, and its accelerometer gives the vertical."
@@ -403,14 +409,6 @@ class Inertial:
 
     def without(self, why: object) -> Inertial:
         return Inertial(None, notes=(*self.notes, f"The gyroscope is not used: {why}."))
-
-    @property
-    def report(self) -> dict[str, Any] | None:
-        """Entry of the report of the poses. None without alignment."""
-        if (found := self.alignment) is None:
-            return None
-        keys = ("R_sensor_imu", "sigma_rad", "time_offset_s", "lever_m")
-        return {key: np.asarray(getattr(found, key)).tolist() for key in keys}
 
 
 def level_poses(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:

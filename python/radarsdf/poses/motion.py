@@ -90,11 +90,7 @@ Priors = tuple[MotionPrior, MotionPrior]  # translation, rotation
 
 
 def way(
-    turn: Floats,
-    begin_mps: Floats,
-    end_mps: Floats,
-    duration_s: float | Floats,
-    levers: Floats | None = None,
+    turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats, levers: Floats | None = None
 ) -> Floats:
     """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
     and linearly changing velocity. `levers` (..., 3, 3): its derivative by the turn, if radars have lever arms, m."""

@@ -23,7 +23,7 @@ from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate, RefinedPoses
-from radarsdf.poses.rigid import steps
+from radarsdf.poses.rigid import lengths_of_steps_m, steps
 from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, Tracked, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
@@ -138,8 +138,7 @@ def odometry(
             covariance = least.widened(rows, poses, covariance, segments, drive)
         if inertial.alignment is not None:
             poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
-    lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    length_m = float(lengths_m[np.diff(segments) == 0].sum())
+    length_m = float(lengths_of_steps_m(poses)[np.diff(segments) == 0].sum())
     gyroscope = drive.gyroscope
     report = {
         "verdict": _summarize(segments, length_m, velocities is not None, inertial),
@@ -149,7 +148,7 @@ def odometry(
         "doppler_sign": scans.sign,
         "gyroscope": gyroscope is not None,
         "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
-        "imu": inertial.report,
+        "imu": None if inertial.alignment is None else inertial.alignment.report,
         "moving": scans.moving,
         "notes": notes,
         "scans": len(tracked),
