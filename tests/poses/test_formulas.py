@@ -282,7 +282,7 @@ def test_returns_are_selected_by_range_and_cells_match_their_spacing():
 def test_a_gain_is_significant_by_students_t():
     gains, groups = np.array([1.0, 3, 4, 8, 0]), np.array([0, 0, 2, 2, 3])  # means of 2, 6 and 0
     verdict = Verdict.by_groups(gains, groups)
-    assert (verdict.gain, verdict.parts) == (pytest.approx(8 / 3), 3)
+    assert (verdict.mean, verdict.count) == (pytest.approx(8 / 3), 3)
     assert verdict.error == pytest.approx(np.std([2, 6, 0], ddof=1) / np.sqrt(3))
     assert verdict.needed == pytest.approx(student.isf(1e-3, 2) * verdict.error)
     assert not verdict.improved

@@ -214,7 +214,7 @@ def test_covariances_of_kept_poses_span_the_refined_ones(street):
 def test_one_moving_object_does_not_count_as_improvement():
     # The gain of each scan is the same, so that scans alone would make it significant.
     one, many = _verdict(1), _verdict(60)
-    assert one.gain > 0
+    assert one.mean > 0
     assert not one.improved
     assert many.improved
 
@@ -229,7 +229,7 @@ def test_contracted_scans_have_no_better_agreement():
         verdict = Verdict.of(
             returns.select(held), returns.select(~held), drive.poses, after, SensorNoise(0.1, 0.01, 0.01)
         )
-        assert verdict.gain > 0  # caused by density alone
+        assert verdict.mean > 0  # caused by density alone
         assert not verdict.improved
 
 

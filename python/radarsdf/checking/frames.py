@@ -102,7 +102,7 @@ def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     agreement = Agreement(recording.points, effort.returns, effort.queries)
     # Neighbours, and scans half a recording apart.
     pairs = [pairs_apart(usable, lag, effort.pairs // 2) for lag in (1, max(1, len(usable) // 2))]
-    near, far = (Gain.of(agreement.scores(p, relative(recording.poses, p)[None])[0]) for p in pairs)
+    near, far = (Gain.of_samples(agreement.scores(p, relative(recording.poses, p)[None])[0]) for p in pairs)
     change = far.mean - near.mean
     error = np.inf if min(near.count, far.count) < _MIN_PAIRS else np.hypot(near.error, far.error)
     moved = change > max(_MIN_GAIN, _MIN_SIGNIFICANCE * error)
@@ -191,7 +191,7 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
         before, after = (np.array([middle(scan[k], axis=0) for scan in scans]) for scans in both)
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
-        significances.append(Gain.of(steadier).significance)
+        significances.append(Gain.of_samples(steadier).significance)
     return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
 
 

@@ -209,10 +209,11 @@ _MOST_CUTS = 10
 _EXCHANGE_GAIN, _EXCHANGE_SIGNIFICANCE = 0.05, 8.0
 
 
-def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
+def check_drift(recording: Scans, config: FitConfig, *, undecided: bool = False) -> Iterator[Finding]:
     """Check whether held-out returns agree better with refined poses, in the clearest of some windows of scans.
 
-    Drift is only one explanation of errors in the steps: a fault that explains them better is reported in its place.
+    Drift is only one explanation of errors in the steps: a fault that explains them better is reported in its place. `undecided`:
+    whether the scans do not show the motion.
     """
     count = len(recording)
     if count < _LEAST_SCANS:
@@ -256,7 +257,7 @@ def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
         elif max(shares) > _CONCENTRATED:
             yield Finding("undecided", "warning", f"Few steps differ from refined ones. {evidence}")
         else:
-            yield Finding("poses_drift", "warning", evidence)
+            yield Finding("undecided" if undecided else "poses_drift", "warning", evidence)
 
 
 def _log_errors(errors: Floats) -> Floats:

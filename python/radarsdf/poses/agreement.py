@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 from scipy.stats import t as student
+from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
 from radarsdf.poses.doppler import SensorVelocities
@@ -69,16 +70,22 @@ class Gain:
     count: int
 
     @classmethod
-    def of(cls, samples: Floats, least: float = 1e-9) -> Gain:
+    def of_samples(cls, samples: Floats, least: float = 1e-9) -> Self:
         """Build from K samples (K, ...), whose standard deviation is at least `least`."""
         spread = samples.std(axis=0, ddof=1) if len(samples) > 1 else np.full(samples.shape[1:], np.inf)
         return cls(samples.mean(axis=0), np.maximum(spread, least) / np.sqrt(len(samples)), len(samples))
 
     @classmethod
-    def over(cls, given: Floats, others: Floats) -> Gain:
+    def over(cls, given: Floats, others: Floats) -> Self:
         """Compare scores `given` (P,) or (H, P) of pairs of scans with others (H, P): exp(-gain) times smaller distances."""
         # The mean of a few pairs that agree by chance must not look certain.
-        return cls.of((given - others).T, 1e-3)
+        return cls.of_samples((given - others).T, 1e-3)
+
+    @classmethod
+    def by_groups(cls, samples: Floats, groups: NDArray[np.integer[Any]]) -> Self:
+        """Build from samples (N,) with common errors within `groups` (N,)."""
+        counts = np.bincount(groups)
+        return cls.of_samples(np.bincount(groups, samples)[counts > 0] / counts[counts > 0])
 
     @property
     def significance(self) -> Any:
@@ -213,7 +220,9 @@ def sign_significance(
             best = logs.mean(axis=2).argmin(axis=1)
             yaws[:, i] = _TURNS_RAD[best]
             gains.append(logs[1, best[1]] - logs[0, best[0]])
-        mean = Gain.of(np.array([gain.mean() for gain in gains]), 1e-6) if gains else Gain(0.0, 1.0, 0)
+        mean = (
+            Gain.of_samples(np.array([gain.mean() for gain in gains]), 1e-6) if gains else Gain(0.0, 1.0, 0)
+        )
         if len(gains) < _FEW_PAIRS:
             # Returns of both scans count, mostly on the same objects: half of them are independent.
             variance = sum(2 * gain.var() / len(gain) for gain in gains) / max(len(gains), 1) ** 2
@@ -242,7 +251,7 @@ def motion_significance(scans: Sequence[Floats], firsts: Ints, steps: Floats) ->
         for i, T in zip(firsts.tolist(), both, strict=True)
         if min(len(scans[i]), len(scans[i + 1])) > 0
     ]
-    return float(Gain.of(np.array(gains), 1e-6).significance) if len(gains) >= _FEW_PAIRS else 0.0
+    return float(Gain.of_samples(np.array(gains), 1e-6).significance) if len(gains) >= _FEW_PAIRS else 0.0
 
 
 def held_out(count: int, seed: int) -> Bools:
@@ -251,12 +260,12 @@ def held_out(count: int, seed: int) -> Bools:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Gain in agreement between returns of different scans."""
+class Verdict(Gain):
+    """Increase of the log density of other scans' returns at held-out ones, as mean over independent scans.
 
-    gain: float  # mean over scans of the increase of the log density of other scans' returns at held-out ones
-    error: float  # its standard error
-    parts: int  # number of independent scans, or of places if these are fewer
+    `count` is the number of scans, or of places if these are fewer.
+    """
+
     # The same gain for the density in cells far larger than pose errors. Where scans contract, in the end on top of each
     # other, all densities rise, whether or not surfaces agree.
     crowding: float = 0.0
@@ -264,21 +273,21 @@ class Verdict:
     @property
     def needed(self) -> float:
         """Minimum gain: relevant, significant (Student's t), and not explained by crowding."""
-        if self.parts < 2:
+        if self.count < 2:
             return np.inf
-        by_chance = float(student.ppf(1 - _BY_CHANCE, self.parts - 1)) * self.error
+        by_chance = float(student.ppf(1 - _BY_CHANCE, self.count - 1)) * self.error
         return max(_LEAST_GAIN, by_chance, self.crowding)
 
     @property
     def improved(self) -> bool:
-        return self.gain > self.needed
+        return bool(self.mean > self.needed)
 
     @property
     def words(self) -> str:
         first, agree = "The given poses are kept", "do not agree"
         if self.improved:
             first, agree = "The refined poses make a sharper map", "agree"
-        change = f"{self.gain:+.2%}, by chance and overlap alone up to {self.needed:.2%}"
+        change = f"{self.mean:+.2%}, by chance and overlap alone up to {self.needed:.2%}"
         agreement = f"{agree} better with those of other scans (their density changes by {change})"
         return f"{first}: returns that took no part {agreement}."
 
@@ -298,25 +307,15 @@ class Verdict:
         edge_m = _PLACE * float(np.median(held.ranges_m))
         cells = np.floor(held.posed(before).points / edge_m)
         places = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
-        by_scans = cls.by_groups(gains, held.scans)
-        parts = min(by_scans.parts, int(places.max()) + 1)
+        by_scans = Gain.by_groups(gains, held.scans)
+        parts = min(by_scans.count, int(places.max()) + 1)
         if parts < 2:
             return cls(0.0, np.inf, parts)
         # Cluster-robust standard error over places.
         sums = np.bincount(places, gains - gains.mean())
         error = float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)) / len(gains))
-        crowding = cls.by_groups(_crowding(held, used, before, after), held.scans).gain
-        return cls(by_scans.gain, max(by_scans.error, error), parts, crowding)
-
-    @classmethod
-    def by_groups(cls, gains: Floats, groups: NDArray[np.integer[Any]]) -> Verdict:
-        """Compute mean and standard error of gains (N,) with common errors within `groups` (N,)."""
-        counts = np.bincount(groups)
-        means = np.bincount(groups, gains)[counts > 0] / counts[counts > 0]
-        if len(means) < 2:
-            return cls(0.0, np.inf, len(means))
-        mean = Gain.of(means)
-        return cls(float(mean.mean), float(mean.error), mean.count)
+        crowding = Gain.by_groups(_crowding(held, used, before, after), held.scans).mean
+        return cls(by_scans.mean, max(by_scans.error, error), parts, crowding)
 
 
 def _gains(

@@ -25,7 +25,6 @@ from radarsdf._core import CommonPlanes
 from radarsdf.arrays import Floats, Ints, Ints32
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import LEAST_MPS, SensorVelocities
 from radarsdf.poses.imu import Inertial
@@ -35,7 +34,7 @@ from radarsdf.poses.planes import SensorReturns, plane_cell_m, planes_of, unbias
 from radarsdf.poses.rigid import assembled, increments, moved, rotation, skew, step_vectors
 from radarsdf.returns.noise import rig_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
-from radarsdf.rig import Label, Rig
+from radarsdf.rig import Imu, Label, Rig
 from radarsdf.scans import Scans, chosen
 from radarsdf.threads import resolve_num_threads
 

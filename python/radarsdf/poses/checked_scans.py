@@ -56,9 +56,11 @@ class CheckedScans:
         check(fits, "Doppler needs times: the time of each scan (times_s), s")
         _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
-        if (range_m := median_range_m(scans)) > _MOST_M:
-            msg = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
-            raise ValueError(msg)
+        range_m = median_range_m(scans)
+        check(
+            range_m <= _MOST_M,
+            f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m",
+        )
         rows, times_s, begin_s, notes = np.arange(len(scans)), None, 0.0, left_out.notes
         if times is not None:
             times_s = _checked_times(times, len(scans))
@@ -132,12 +134,11 @@ class CheckedScans:
         step_m = 0.0 if self.velocities is None else self.velocities.usual_mps * interval_s
         range_m = median_range_m(self.scans)
         low, high = _INTERVALS_S
-        if step_m > _MOST_REACHES * range_m or not low <= interval_s <= high:
-            msg = (
-                f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler, "
-                f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s"
-            )
-            raise ValueError(msg)
+        check(
+            step_m <= _MOST_REACHES * range_m and low <= interval_s <= high,
+            f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler, "
+            f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s",
+        )
 
 
 def join_radars(rig: Rig | None, radars: Sequence[CheckedScans]) -> CheckedScans:

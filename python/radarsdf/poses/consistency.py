@@ -403,19 +403,19 @@ class _Pairs:
         shares = self.along[np.isfinite(self.along)]
         if len(shares) < FEWEST_STEPS:
             return 0.0, np.inf
-        mean = Gain.of(shares)
+        mean = Gain.of_samples(shares)
         return float(mean.mean), float(student.ppf(1 - level, mean.count - 1) * mean.error)
 
     def others(self, level: float) -> Iterator[tuple[float, float]]:
         """Yield the evidence of other motions than that by Doppler, significant above 1, and the ratios of their speeds to its."""
-        yield -float(Gain.of(self.gains[:, _SAME]).excess(level)), -1.0
+        yield -float(Gain.of_samples(self.gains[:, _SAME]).excess(level)), -1.0
         share, limit = self.tracked(level)
         means = self.gains.mean(axis=0)
         best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
         # Of a radar that is too narrow, gains increase up to the end of the scales.
         if best not in (here, 0, len(_SCALES) - 1) and abs(share) + limit >= _SAME_SCALE - 1:
             loss = self.gains[:, best] - self.gains[:, here]
-            yield float(Gain.of(loss).excess(level / len(_SCALES))), float(_SCALES[best])
+            yield float(Gain.of_samples(loss).excess(level / len(_SCALES))), float(_SCALES[best])
         # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
         other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
         gains = self.gains[np.isfinite(self.along)]
@@ -426,9 +426,9 @@ class _Pairs:
     def farthest(self) -> float:
         """Ratio of speeds to those by Doppler of the most different motion that the returns do not exclude."""
         own = self.gains[:, _SAME]
-        if Gain.of(own).excess(BY_CHANCE) < 1:
+        if Gain.of_samples(own).excess(BY_CHANCE) < 1:
             return -1.0
-        possible = _SCALES[Gain.of(own[:, None] - self.gains).excess(BY_CHANCE) <= 1]
+        possible = _SCALES[Gain.of_samples(own[:, None] - self.gains).excess(BY_CHANCE) <= 1]
         share, limit = self.tracked(BY_CHANCE)
         return 1 + min(float(np.abs(possible - 1).max(initial=0)), abs(share) + limit)
 
@@ -440,7 +440,7 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
     contradictions, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
     # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
     moving = pairs.select(~pairs.slow)
-    pattern_moves = len(moving) >= FEWEST_STEPS and Gain.of(moving.moved).excess(BY_CHANCE) < 1
+    pattern_moves = len(moving) >= FEWEST_STEPS and Gain.of_samples(moving.moved).excess(BY_CHANCE) < 1
     for rows in tried:
         window, first, last = pairs.select(rows), int(scans[rows.start]), int(scans[rows.stop])
         still, moving = window.select(window.slow), window.select(~window.slow)
@@ -453,11 +453,11 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             # After a motion d, log distances after opposite shifts s differ by log((s + d) / (s - d)), about 2 d / s.
             shifts_m = np.linalg.norm(_SHIFTS_M[: opposite.shape[1]], axis=1)
             moved_m = np.abs(opposite.mean(axis=0)) * shifts_m / 2
-            evidence = np.where(moved_m > LEAST_M, np.abs(Gain.of(opposite).excess(of_each)), 0.0)
+            evidence = np.where(moved_m > LEAST_M, np.abs(Gain.of_samples(opposite).excess(of_each)), 0.0)
             found.append((True, float(evidence.max()), None))
             # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
             if 2 * len(window) >= len(pairs) - 1:
-                found.append((False, 2 - float(Gain.of(losses).excess(of_each).min()), None))
+                found.append((False, 2 - float(Gain.of_samples(losses).excess(of_each).min()), None))
         if len(moving) >= FEWEST_STEPS:
             found += [(True, *other) for other in moving.others(level)]
             if abs(moving.farthest - 1) > _MEASURED:

@@ -137,14 +137,11 @@ def radial_offset_mps(
             continue
         away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
         columns = np.column_stack([-away, np.ones(len(away))])
-        normal = normal_matrix(columns, columns)
-        if np.linalg.cond(normal) > 1e6:
-            continue
-        inverse = np.linalg.inv(normal)
-        fitted = np.einsum("ij,nj,n->i", inverse, columns, speeds[used])
-        spread = float(((speeds[used] - np.einsum("ni,i->n", columns, fitted)) ** 2).sum()) / (used.sum() - 4)
-        offsets.append(float(fitted[3]))
-        variances.append(max(spread, _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
+        fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
+        if rank == 4:
+            inverse = np.linalg.inv(normal_matrix(columns, columns))
+            offsets.append(float(fitted[3]))
+            variances.append(max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
     if len(offsets) < _FEWEST_OFFSETS:
         return 0.0
     weights = 1 / np.array(variances)

@@ -24,10 +24,10 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats, Ints
-from radarsdf.imu import Imu
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.motion import MotionRate, interpolate, usual_duration_s
 from radarsdf.poses.rigid import covariance_in, nearest_rotation, rotation, rotation_vector
+from radarsdf.rig import Imu
 
 # Prior bias and noise, of cheap gyroscopes, until they are estimated from the drive.
 FIRST_BIAS_RAD_S = 0.02

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.imu import Imu
 from radarsdf.map.map import Map
 from radarsdf.poses.odometry import track_scans
 from radarsdf.poses.planes import PlaneMap, SensorReturns, least_certain, plane_cell_m, thin
@@ -24,6 +23,7 @@ from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near,
 from radarsdf.poses.tracking import Drive, Tracked
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
+from radarsdf.rig import Imu
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 

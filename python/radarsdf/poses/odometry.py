@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.imu import Imu
 from radarsdf.poses.agreement import ERRORS, motion_significance
 from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.consistency import Consistency
@@ -26,6 +25,7 @@ from radarsdf.poses.refine import PosesEstimate, RefinedPoses
 from radarsdf.poses.rigid import lengths_of_steps_m, steps
 from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, Tracked, track_drive
 from radarsdf.returns.rays import within_ranges
+from radarsdf.rig import Imu
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 

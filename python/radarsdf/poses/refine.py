@@ -263,8 +263,8 @@ def refine_poses(
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
     report |= {
         "verdict": verdict.words,
-        "gain": verdict.gain,
-        "gain_error": verdict.error,
+        "gain": float(verdict.mean),
+        "gain_error": float(verdict.error),
         "sigma_m": sigma_m,
         "sigma_rad": sigma_rad,
         "bias": found.motions[0].bias.tolist(),
