@@ -19,7 +19,7 @@ import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.changes.changes import GONE, UNSEEN, Changes
-from radarsdf.poses.posed import pose_sigmas
+from radarsdf.poses.odometry import pose_sigmas
 from radarsdf.simulate import Box, Scene, Simulation, drifted, materials, simulate
 from scipy.spatial.transform import Rotation
 

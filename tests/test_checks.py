@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, checks
-from radarsdf.imu import Imu
 from radarsdf.lattice import WorldLattice
 from radarsdf.memory import available_bytes
+from radarsdf.rig import Imu
 from scipy.spatial.transform import Rotation
 
 FAR = np.nextafter(1e12, np.inf)

@@ -9,7 +9,7 @@ import radarsdf
 
 ROOT = Path(radarsdf.__file__).parent
 BASE = [
-    "_core", "arrays", "checks", "extras", "imu", "interrupts", "lattice", "memory", "products", "rig", "scans", "settings", "threads",
+    "_core", "arrays", "checks", "extras", "interrupts", "lattice", "memory", "products", "rig", "scans", "settings", "threads",
 ]  # fmt: skip
 # From the lowest to the highest. A subpackage may import itself and those before it; `io` is below `map`, which saves itself.
 METHOD = ["config", "returns", "field", "io", "map", "fitting"]

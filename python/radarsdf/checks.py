@@ -134,9 +134,8 @@ def check_pose(pose: Any, name: str) -> Floats:
 def check_poses(poses: ArrayLike, num_scans: int | None = None) -> Floats:
     """Convert to rigid transforms (F, 4, 4) float64 T_world_sensor, m, one per scan if the number of scans is given."""
     T_world_sensor = pose_matrices(poses, num_scans)
-    for i in np.flatnonzero(~are_rigid(T_world_sensor))[:1]:
-        msg = f"pose {i} is not a rigid transform ({_RIGID})"
-        raise ValueError(msg)
+    rigid = are_rigid(T_world_sensor)
+    check(rigid.all(), f"pose {int(np.argmin([*rigid, False]))} is not a rigid transform ({_RIGID})")
     return T_world_sensor
 
 
@@ -146,14 +145,20 @@ def usable_poses(poses: ArrayLike, num_scans: int | None = None) -> tuple[Floats
     rigid = are_rigid(T_world_sensor)
     if rigid.all() or 2 * np.count_nonzero(rigid) <= len(rigid):
         return check_poses(T_world_sensor), rigid
-    rows, known = np.arange(len(rigid)), np.flatnonzero(rigid)
-    at = np.clip(rows, known[0], known[-1])
-    filled = np.tile(np.eye(4), (len(rigid), 1, 1))
+    known = np.flatnonzero(rigid)
     rotations = Slerp(known, Rotation.from_matrix(T_world_sensor[known, :3, :3]))
-    filled[:, :3, :3] = rotations(at).as_matrix()
-    for axis in range(3):
-        filled[:, axis, 3] = np.interp(at, known, T_world_sensor[known, axis, 3])
+    at = np.clip(np.arange(len(rigid)), known[0], known[-1])
+    filled = interpolated_poses(at, rotations, T_world_sensor[known, :3, 3])
     return np.where(rigid[:, None, None], T_world_sensor, filled), rigid
+
+
+def interpolated_poses(at: Array, rotations: Slerp, positions: Floats) -> Floats:
+    """Interpolate poses (N, 4, 4): `rotations` at times `at` (N,), and positions (P, 3) at the times of the rotations linearly."""
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, :3, :3] = rotations(at).as_matrix()
+    for axis in range(3):
+        poses[:, axis, 3] = np.interp(at, rotations.times, positions[:, axis])
+    return poses
 
 
 def are_rigid(poses: Floats) -> Bools:

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Array, Floats, Ints
 from radarsdf.checks import MISSING_POSES, check, one_for_each_scan, pose_matrices
-from radarsdf.imu import Imu
-from radarsdf.rig import Label, Rig
+from radarsdf.rig import Imu, Label, Rig
 
 _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")

@@ -4,7 +4,8 @@ import re
 
 import numpy as np
 import pytest
-from radarsdf.checking.agreement import Agreement, Comparison, choose_pairs, hypotheses, pairs_apart
+from radarsdf.checking.frames import hypotheses
+from radarsdf.poses.agreement import Agreement, Gain, choose_pairs, pairs_apart
 from scipy.spatial.transform import Rotation
 
 PAIRS = np.array([[0, 1], [1, 3]])
@@ -121,12 +122,12 @@ def test_scores_against_a_plain_calculation():
 
 def test_a_gain_has_the_standard_error_of_its_mean():
     given, other = np.array([1.0, 2.0, 4.0, 3.0]), np.array([[0.5, 1.0, 2.0, 2.5]])
-    found = Comparison.of(given, other)
+    found = Gain.over(given, other)
     better = given - other[0]
-    assert found.gains[0] == pytest.approx(better.mean())
-    assert found.errors[0] == pytest.approx(better.std(ddof=1) / 2)
+    assert found.mean[0] == pytest.approx(better.mean())
+    assert found.error[0] == pytest.approx(better.std(ddof=1) / 2)
     assert found.significance[0] == pytest.approx(better.mean() / (better.std(ddof=1) / 2))
-    assert Comparison.of(given[:1], other[:, :1]).significance[0] == 0  # a single pair is no evidence
+    assert Gain.over(given[:1], other[:, :1]).significance[0] == 0  # a single pair is no evidence
 
 
 def test_pairs_are_neighbours_and_scans_after_a_displacement():

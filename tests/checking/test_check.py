@@ -6,10 +6,10 @@ import re
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.checking import drift as drift_checks
-from radarsdf.checking.drift import check_drift
+from radarsdf.checking import trajectory as trajectory_checks
 from radarsdf.checking.noise import check_noise_and_cost
 from radarsdf.checking.recording import checked_input
+from radarsdf.checking.trajectory import check_drift
 from radarsdf.io import Scans
 from radarsdf.simulate import drifted
 
@@ -101,15 +101,15 @@ def test_a_gain_without_effect_is_no_drift():
 
 def test_large_recordings_are_checked_in_windows(drive, monkeypatch):
     asked = []
-    refine = drift_checks.refine_poses
+    refine = trajectory_checks.refine_poses
 
     def counted(points, poses, **settings):
         asked.append((len(poses), sum(map(len, points))))
         return refine(points, poses, **settings)
 
-    monkeypatch.setattr(drift_checks, "refine_poses", counted)
-    monkeypatch.setattr(drift_checks, "_SCANS", 12)
-    monkeypatch.setattr(drift_checks, "_RETURNS", 8000)
+    monkeypatch.setattr(trajectory_checks, "refine_poses", counted)
+    monkeypatch.setattr(trajectory_checks, "_SCANS", 12)
+    monkeypatch.setattr(trajectory_checks, "_RETURNS", 8000)
     (found,) = check_drift(recording(drive, drifted(drive.poses, 0.05, 0.004, 1)), CONFIG)
     assert [scans for scans, _ in asked] == [12, 12, 12]
     assert max(returns for _, returns in asked) <= 8500

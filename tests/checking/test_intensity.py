@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
-from radarsdf.checking.intensity import check_intensities
-from radarsdf.checking.noise import check_elevation, check_ground
+from radarsdf.checking.noise import check_elevation, check_ground, check_intensities
 from radarsdf.checking.recording import checked_input
 
 pytestmark = pytest.mark.usefixtures("right_frames")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.checking.drift import check_drift, check_order
 from radarsdf.checking.recording import checked_input
+from radarsdf.checking.trajectory import check_drift, check_order
 from scipy.spatial.transform import Rotation
 
 SCANS = 40

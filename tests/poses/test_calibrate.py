@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.checking.mounting import misread_radars
+from radarsdf.checking.doppler import misread_radars
 from radarsdf.poses.rigid import increments, moved, transform
 from radarsdf.scans import Scans
 from radarsdf.simulate import MountedRadar, measured_imu, simulate_rig

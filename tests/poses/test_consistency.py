@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.live.tracking import Lost
+from radarsdf.poses.agreement import sign_significance, turns_fast
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.displacements import Clock, compare_with_poses, contradiction
-from radarsdf.poses.doppler import sign_significance, turns_fast
-from radarsdf.poses.drive import Drive
+from radarsdf.poses.consistency import Clock, Consistency, contradiction
+from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
 
 from scenes.kinds import KINDS
@@ -141,13 +140,13 @@ def test_a_delay_that_the_returns_do_not_exclude_widens_the_deviations():
 
 def test_doppler_of_other_scans_contradicts_given_poses(street, motion):
     velocities = CheckedScans.of(street.points, motion.doppler_mps, motion.times_s).velocities
-    assert compare_with_poses(velocities, motion.times_s, street.poses)[0] is None
+    assert Consistency.of_poses(velocities, motion.times_s, street.poses).contradiction is None
     late = dataclasses.replace(velocities, mean_mps=velocities.mean_mps[np.maximum(np.arange(20) - 3, 0)])
-    assert "3 scans later" in compare_with_poses(late, motion.times_s, street.poses)[0]
+    assert "3 scans later" in Consistency.of_poses(late, motion.times_s, street.poses).contradiction
     # Displacements that are wrong by a share of the change of the speed agree with no delay.
     before = velocities.mean_mps[np.maximum(np.arange(20) - 1, 0)]
     mixed = dataclasses.replace(velocities, mean_mps=0.7 * velocities.mean_mps + 0.3 * before)
-    assert compare_with_poses(mixed, motion.times_s, street.poses)[0] is None
+    assert Consistency.of_poses(mixed, motion.times_s, street.poses).contradiction is None
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.0, -1.0, 1.2])

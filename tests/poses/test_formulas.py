@@ -1,31 +1,37 @@
 """Covariances, derivatives and rates of motions, against random draws, finite differences and manual values."""
 
 import dataclasses
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf import FitConfig, RefinedPoses
-from radarsdf.poses.checked_scans import median_range_m
-from radarsdf.poses.doppler import (
+from radarsdf.poses.agreement import (
     CLEAR,
     ERRORS,
-    NoVelocityError,
-    SensorVelocities,
-    log_distances,
+    Verdict,
+    _crowding,
+    _gains,
     motion_significance,
+    of_neighbours,
     sign_significance,
-    upright,
 )
-from radarsdf.poses.drive import Drive, rates_of, track_drive
-from radarsdf.poses.estimate import _by_biases
-from radarsdf.poses.gyroscope import Gyroscope
+from radarsdf.poses.checked_scans import median_range_m
+from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, upright
+from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
-from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
-from radarsdf.poses.posed import PosedScans, pose_sigmas
-from radarsdf.poses.registration import PlaneMap, _removed_share, apart_m, thin
+from radarsdf.poses.odometry import PosedScans, pose_sigmas
+from radarsdf.poses.planes import (
+    PlaneMap,
+    SensorReturns,
+    _removed_share,
+    apart_m,
+    plane_cell_m,
+    reduction,
+    thin,
+)
+from radarsdf.poses.refine import _by_biases
 from radarsdf.poses.rigid import (
     aligned,
     between,
@@ -41,8 +47,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import Tracked, begin_segment
-from radarsdf.poses.verdict import Verdict, _crowding, _gains
+from radarsdf.poses.tracking import Drive, Tracked, begin_segment, rates_of, track_drive
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
 from scipy.stats import t as student
@@ -236,7 +241,7 @@ def test_rates_of_a_step_lead_to_the_next_one():
 def test_a_gyroscope_learns_from_turns_with_the_covariance_of_their_rates(monkeypatch):
     rate, asked = MotionRate(np.array([0.1, -0.2, 0.3]), spread(12, 3)), []
     passed = [begin_segment(np.eye(4))] * 3, [(rate, rate), (None, None)]
-    monkeypatch.setattr("radarsdf.poses.drive.track_once", lambda *_: passed)
+    monkeypatch.setattr("radarsdf.poses.tracking.track_once", lambda *_: passed)
     gyroscope = SimpleNamespace(learnt=asked.append)
     track_drive(Drive([np.eye(3)] * 3, np.array([0, 0.5, 0.7]), None, gyroscope), FitConfig(), 1, False)
     assert asked == [[rate, None]]
@@ -277,7 +282,7 @@ def test_returns_are_selected_by_range_and_cells_match_their_spacing():
 def test_a_gain_is_significant_by_students_t():
     gains, groups = np.array([1.0, 3, 4, 8, 0]), np.array([0, 0, 2, 2, 3])  # means of 2, 6 and 0
     verdict = Verdict.by_groups(gains, groups)
-    assert (verdict.gain, verdict.parts) == (pytest.approx(8 / 3), 3)
+    assert (verdict.mean, verdict.count) == (pytest.approx(8 / 3), 3)
     assert verdict.error == pytest.approx(np.std([2, 6, 0], ddof=1) / np.sqrt(3))
     assert verdict.needed == pytest.approx(student.isf(1e-3, 2) * verdict.error)
     assert not verdict.improved
@@ -416,8 +421,9 @@ def test_the_displacement_between_scans_is_found_and_common_patterns_cancel():
     scales = np.array([0.5, 0.8, 1.0, 1.25])
 
     def gains(first, second, moved_m):
-        back, ahead = (log_distances(first, second, np.outer(s * scales, moved_m)) for s in (-1, 1))
-        return back - ahead
+        steps = transform(np.zeros((8, 3)), np.outer([*-scales, *scales], moved_m))
+        logs = of_neighbours([first, second]).log_distances(1, 0, steps).mean(axis=1)
+        return np.subtract(*np.split(logs, 2))
 
     assert gains(world, world - moved_m, moved_m).argmax() == 2
     # Two views of a wall along the motion agree equally for either direction.
@@ -440,13 +446,12 @@ def test_one_pair_of_scans_of_a_turning_sensor_shows_the_sign_of_the_doppler():
 
 def test_scans_of_walls_along_the_motion_agree_best_without_it():
     rng = np.random.default_rng(5)
-    motion = np.eye(4)
+    motion, firsts = np.eye(4), np.arange(11)
     motion[0, 3] = 1.0
+    motions = np.tile(motion, (11, 1, 1))
     walls = [np.column_stack([rng.uniform(-10, 10, 300), np.repeat([-2.0, 2.0], 150), np.zeros(300)])] * 12
-    assert (
-        motion_significance(list(itertools.pairwise(walls)), [motion] * 11) < -ERRORS
-    )  # the same clutter in each scan
+    assert motion_significance(walls, firsts, motions) < -ERRORS  # the same clutter in each scan
     world = rng.uniform(-20, 20, (500, 3))
     scans = [world - i * motion[:3, 3] for i in range(12)]
-    assert motion_significance(list(itertools.pairwise(scans)), [motion] * 11) > ERRORS
-    assert motion_significance([(world, world)], [motion]) == 0  # too few
+    assert motion_significance(scans, firsts, motions) > ERRORS
+    assert motion_significance([world, world], firsts[:1], motions[:1]) == 0  # too few

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
-from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError, cumulate_turns
-from radarsdf.poses.imu import ImuAlignment, Inertial, _windows, level_poses
+from radarsdf.poses.imu import (
+    Gyroscope,
+    ImuAlignment,
+    Inertial,
+    UnusableGyroscopeError,
+    _windows,
+    cumulate_turns,
+    level_poses,
+)
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu

@@ -9,11 +9,11 @@ import radarsdf
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.storage import checked_report
+from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.loops import open_loops
-from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, unbiased_normals
-from radarsdf.poses.posed import trajectory_report
+from radarsdf.poses.odometry import trajectory_report
+from radarsdf.poses.planes import SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.rigid import aligned, turned_by
-from radarsdf.poses.verdict import Verdict
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import Surfels
 from radarsdf.simulate import drifted
@@ -214,7 +214,7 @@ def test_covariances_of_kept_poses_span_the_refined_ones(street):
 def test_one_moving_object_does_not_count_as_improvement():
     # The gain of each scan is the same, so that scans alone would make it significant.
     one, many = _verdict(1), _verdict(60)
-    assert one.gain > 0
+    assert one.mean > 0
     assert not one.improved
     assert many.improved
 
@@ -229,7 +229,7 @@ def test_contracted_scans_have_no_better_agreement():
         verdict = Verdict.of(
             returns.select(held), returns.select(~held), drive.poses, after, SensorNoise(0.1, 0.01, 0.01)
         )
-        assert verdict.gain > 0  # caused by density alone
+        assert verdict.mean > 0  # caused by density alone
         assert not verdict.improved
 
 
@@ -295,7 +295,7 @@ def test_scans_that_move_together_cost_nothing():
     poses[:, 0, 3] = [0, 0.5, 1.2]
     scans = [np.column_stack([rng.uniform(2, 9, (3000, 2)), rng.normal(-1, 0.05, 3000)]) for _ in poses]
     returns = SensorReturns.of(scans, 0.0, None)
-    planes, _ = common_planes(returns, poses, PlaneGrid(3, False, 0.4), None, ReturnsConfig(), 1)
+    planes, _ = common_planes(returns, poses, 3, 0.4, None, ReturnsConfig(), 1)
     weak = np.tile(np.eye(6), (3, 1, 1))
     pull = np.zeros((3, 6))
     for k, direction in enumerate(np.eye(3)):
@@ -319,7 +319,7 @@ def test_a_noisy_scan_has_an_unbiased_height(height_m):
         for noise_m in noises_m
     ]
     returns = SensorReturns.of(scans, 0.0, None)
-    planes, _ = common_planes(returns, poses, PlaneGrid(10, False, 0.4), None, ReturnsConfig(), 1)
+    planes, _ = common_planes(returns, poses, 10, 0.4, None, ReturnsConfig(), 1)
     weak = np.tile(np.eye(6), (10, 1, 1))
     moved = planes.solve(weak, np.zeros((9, 6, 6)), np.zeros((10, 6)), 1e-6, 100, False, 1)[0][:, 2]
     assert (

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import Scans
-from radarsdf.poses.body import BodyVelocities
-from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
+from radarsdf.poses.doppler import BodyVelocities, DopplerMotion, SensorVelocities
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import aligned, rotation, turned_by
 from radarsdf.rig import Rig

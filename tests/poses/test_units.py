@@ -7,13 +7,13 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Imu
+from radarsdf.poses.agreement import sign_significance
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.doppler import sign_significance
-from radarsdf.poses.drive import Drive
-from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
+from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import aligned
+from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
 
 from scenes.kinds import KINDS

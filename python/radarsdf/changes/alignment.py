@@ -11,9 +11,9 @@ from radarsdf._core import LocalPlanes
 from radarsdf.arrays import Floats, Ints
 from radarsdf.changes.probability import PARALLEL, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.map.threshold import across_triangles
+from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.rigid import moved, rotation_vector, skew
 from radarsdf.poses.search import Lost, OrientedPoints, SurfaceIndex, search
-from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.threads import resolve_num_threads

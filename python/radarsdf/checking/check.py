@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Bools, Ints
-from radarsdf.checking import drift, frames, noise, trajectory
-from radarsdf.checking.doppler import check_doppler
-from radarsdf.checking.intensity import check_intensities
-from radarsdf.checking.mounting import check_mountings, misread_radars
+from radarsdf.arrays import Ints
+from radarsdf.checking import frames, noise, trajectory
+from radarsdf.checking.doppler import check_doppler, check_mountings, misread_radars
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
 from radarsdf.checks import are_rigid, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
@@ -108,20 +106,28 @@ def _stops(findings: list[Finding]) -> bool:
 def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
     """All findings, worst first. `config` None: only the cheap ones."""
     found, recording, numbers = _usable(recording)
-    if not _stops(found):
-        for check_values in (
-            trajectory.check_times,
-            noise.check_elevation,
-            trajectory.check_rounding,
-            check_intensities,
-        ):
-            found += check_values(recording)
-        found += trajectory.check_duplicates(recording, numbers)
-        found += _of_poses(recording, numbers, effort)
+    if _stops(found):
+        return _sorted(found)
+    found += trajectory.check_times(recording)
+    found += noise.check_elevation(recording)
+    found += trajectory.check_rounding(recording)
+    found += noise.check_intensities(recording)
+    found += trajectory.check_duplicates(recording, numbers)
+    of_poses = list(frames.check_still(recording, effort)) or list(frames.check_frames(recording, effort))
+    if not _stops(of_poses):
+        of_poses += trajectory.check_lengths(recording)
+    if not _stops(of_poses):
+        of_poses += trajectory.check_jumps(recording, numbers, effort)
+        of_poses += check_doppler(recording)
+        of_poses += noise.check_ground(recording)
+    found += of_poses
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
-            found += _drift(recording, numbers, config, found)
+            # Exchanged scans first, which refined poses would hide.
+            faults = list(trajectory.check_order(recording, numbers))
+            undecided = any(finding.name == "motion_undecided" for finding in found)
+            found += faults or trajectory.check_drift(recording, config, undecided=undecided)
     return _sorted(found)
 
 
@@ -129,80 +135,56 @@ def _sorted(found: list[Finding]) -> list[Finding]:
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
-def _drift(recording: Scans, numbers: Ints, config: FitConfig, found: list[Finding]) -> list[Finding]:
-    """Exchanged scans, which refined poses would hide, or drift of the poses or what explains it better."""
-    faults = list(drift.check_order(recording, numbers)) or list(drift.check_drift(recording, config))
-    unknown = any(finding.name == "motion_undecided" for finding in found)
-    return [
-        Finding("undecided", "warning", fault.evidence) if unknown and fault.name == "poses_drift" else fault
-        for fault in faults
-    ]
-
-
-def _of_poses(recording: Scans, numbers: Ints, effort: frames.Effort) -> list[Finding]:
-    found = list(frames.check_still(recording, effort))
-    if not found:
-        found = list(frames.check_frames(recording, effort))
-    if not _stops(found):
-        found += trajectory.check_lengths(recording)
-    if not _stops(found):
-        found += trajectory.check_jumps(recording, numbers, effort)
-        found += check_doppler(recording)
-        found += noise.check_ground(recording)
-    return found
-
-
 def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
     """Findings about unusable rows, scans and poses, the recording without them, and the numbers (F,) of its scans."""
     found: list[Finding] = []
-    numbers = np.arange(len(recording))
-    returns = [measured(scan) for scan in recording.points]
-    far = [too_far(*each) for each in zip(recording.points, returns, strict=True)]
-    found += _far(recording, returns, sum(int(mask.sum()) for mask in far))
-    left_out = [~mask for mask in returns]
-    total, unmeasured = sum(map(len, left_out)), sum(int(mask.sum()) for mask in left_out)
-    infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in recording.points)
-    if infinite:
-        evidence = f"{infinite} of {total} returns have coordinates that are not finite."
-        found.append(Finding("returns_not_finite", "note", evidence))
-    if unmeasured > infinite:
-        count = f"{unmeasured - infinite} of {total} returns"
-        evidence = f"{count} are no measurements: 0 0 0, or consecutive copies of one point."
-        found.append(Finding("padding", "note", evidence))
-    left_out = [mask | apart for mask, apart in zip(left_out, far, strict=True)]
-    if any(mask.any() for mask in left_out):
-        recording = _without(recording, left_out)
-    empty = np.array([mask.all() for mask in left_out])
+    numbers, points = np.arange(len(recording)), recording.points
+    returns = [measured(scan) for scan in points]
+    far = [too_far(*each) for each in zip(points, returns, strict=True)]
+    ranges = np.concatenate(
+        [np.linalg.norm(scan[of], axis=1) for scan, of in zip(points, returns, strict=True)]
+    )
+    total, most = sum(map(len, points)), ranges.max(initial=0.0)
+    infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in points)
+    for name, count, of, what in (
+        (
+            "far_returns",
+            sum(int(mask.sum()) for mask in far),
+            len(ranges),
+            "beyond 100 times the median range of their scan",
+        ),
+        ("returns_not_finite", infinite, total, "not finite in their coordinates"),
+        (
+            "padding",
+            total - len(ranges) - infinite,
+            total,
+            "no measurements: 0 0 0, or consecutive copies of one point",
+        ),
+    ):
+        if count > 0:
+            found.append(Finding(name, "note", f"{count} of {of} returns are {what}."))
+    counts = np.unique((np.log(ranges / most) / _EQUAL).round(), return_counts=True)[1]
+    if len(counts) > _NEXT and counts[-1] > _LEAST_EQUAL + _ABOVE_NEXT * counts[-1 - _NEXT : -1].max():
+        evidence = f"{counts[-1]} of {len(ranges)} returns are at exactly the largest range, {most:g} m."
+        found.append(Finding("range_sentinel", "warning", evidence))
+    kept = [mask & ~apart for mask, apart in zip(returns, far, strict=True)]
+    if not all(mask.all() for mask in kept):
+        columns = {name: getattr(recording, name) for name in ("points", "intensities", "doppler_mps")}
+        columns = {
+            name: None
+            if arrays is None
+            else [values[mask] for values, mask in zip(arrays, kept, strict=True)]
+            for name, arrays in columns.items()
+        }
+        recording = Scans(**columns, poses=recording.poses, times_s=recording.times_s)
+    empty = np.array([not mask.any() for mask in kept])
     if empty.any():
-        count, first = f"{empty.sum()} of {len(empty)}", np.argmax(empty)
-        evidence = f"{count} scans have no returns, the first is scan {first}."
+        evidence = (
+            f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
+        )
         found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
     if not empty.all():
         found += trajectory.check_rigid(recording)
         numbers = np.flatnonzero(~empty & are_rigid(recording.poses))
         recording = recording.select(numbers)
     return found, recording, numbers
-
-
-def _far(recording: Scans, returns: list[Bools], num_far: int) -> Iterator[Finding]:
-    """Report returns that a fit leaves out as too far away, and a farthest range that is much too frequent."""
-    pairs = zip(recording.points, returns, strict=True)
-    ranges = np.concatenate([np.linalg.norm(scan[mask], axis=1) for scan, mask in pairs])
-    most = ranges.max(initial=0.0)
-    counts = np.unique((np.log(ranges / most) / _EQUAL).round(), return_counts=True)[1]
-    if num_far:
-        evidence = f"{num_far} of {len(ranges)} returns are beyond 100 times the median range of their scan."
-        yield Finding("far_returns", "note", evidence)
-    if len(counts) > _NEXT and counts[-1] > _LEAST_EQUAL + _ABOVE_NEXT * counts[-1 - _NEXT : -1].max():
-        evidence = f"{counts[-1]} of {len(ranges)} returns are at exactly the largest range, {most:g} m."
-        yield Finding("range_sentinel", "warning", evidence)
-
-
-def _without(recording: Scans, left_out: list[Bools]) -> Scans:
-    """Remove the rows in the mask (N_i,) of each scan."""
-    points, intensities, doppler_mps = (
-        None if arrays is None else [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]
-        for arrays in (recording.points, recording.intensities, recording.doppler_mps)
-    )
-    assert points is not None
-    return Scans(points, recording.poses, intensities, doppler_mps=doppler_mps, times_s=recording.times_s)

@@ -1,17 +1,22 @@
-"""Checks of Doppler velocities: their consistency, and their agreement with poses, axes and intensities."""
+"""Checks of Doppler velocities: their agreement with poses, axes, intensities and the mountings of several radars."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 
 import numpy as np
 
 from radarsdf.arrays import Array, Floats, Ints
 from radarsdf.checking.recording import Finding, ascending_times_s, some_scans
-from radarsdf.poses.displacements import compare_with_poses, contradiction
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.poses.agreement import Agreement, Gain, choose_pairs
+from radarsdf.poses.calibrate import calibrate
+from radarsdf.poses.consistency import Consistency, contradiction
 from radarsdf.poses.doppler import LEAST_MPS, NoVelocityError, SensorVelocities, radial_offset_mps
-from radarsdf.poses.rigid import rotation, step_vectors
+from radarsdf.poses.rigid import increments, rotation, step_vectors
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
+from radarsdf.rig import Label
 from radarsdf.scans import Scans
 
 _STILL_MPS = 0.3  # slower velocities have no reliable direction
@@ -72,18 +77,19 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
     by_poses = velocity_of_poses(recording.poses, knots)[scans]
     used = (scans > 0) & (scans < len(recording) - 1)
     used &= (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
-    if used.sum() < _MIN_SCANS:
-        if times is not None:
-            yield from _compared_speeds(recording, scans, by_poses, by_doppler)
-        return
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (by_doppler[used], by_poses[used]))
-    cosine = float(np.median(np.einsum("na,na->n", a, b)))
+    moves = used.sum() >= _MIN_SCANS
+    cosine = float(np.median(np.einsum("na,na->n", a, b))) if moves else 1.0
     sign = -1.0 if cosine < -0.8 else 1.0
     if times is not None:
-        found = list(_compared_speeds(recording, scans, by_poses, sign * by_doppler))
-        yield from found
-        yield from _compared_in_block(recording, times, sign, known=bool(found))
-    if cosine < -0.8:
+        inner = (scans > 0) & (scans < len(recording) - 1)
+        variances, edges = np.full(int(inner.sum()), LEAST_MPS**2), np.append(scans[inner], scans[inner][-1:])
+        found = contradiction(by_poses[inner], sign * by_doppler[inner], variances, edges)
+        wrong = None if found is None else found.words("the poses")
+        yield from _compared_in_block(recording, times, sign, wrong)
+    if not moves:
+        return
+    if sign < 0:
         # Sign conventions differ, and moving returns are found with either: so this is not a fault of the data.
         evidence = f"By its Doppler the sensor moves backwards where its poses move forwards (median cosine {cosine:.2f})."
         yield Finding("doppler_sign", "note", evidence)
@@ -98,41 +104,28 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
         yield Finding("sensor_turned", "warning", evidence)
 
 
-def _compared_speeds(
-    recording: Scans, scans: Ints, by_poses: Floats, by_doppler: Floats
+def _compared_in_block(
+    recording: Scans, times_s: Floats, sign: float, wrong: str | None
 ) -> Iterator[Finding]:
-    """Compare velocities (K, 3) of scans (K,), sensor frame, m/s, by window."""
-    used = (scans > 0) & (scans < len(recording) - 1)
-    variances = np.full(int(used.sum()), LEAST_MPS**2)
-    scans = np.append(scans[used], scans[used][-1:])
-    found = contradiction(by_poses[used], by_doppler[used], variances, scans)
-    if found is not None:
-        yield _contradiction(found.words("the poses"))
+    """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone.
 
-
-def _compared_in_block(recording: Scans, times_s: Floats, sign: float, *, known: bool) -> Iterator[Finding]:
-    """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone."""
-    assert recording.doppler_mps is not None
+    `wrong`: what contradicts the Doppler of all scans.
+    """
     begin = max(0, (len(recording) - _BLOCK) // 2)
     rows = slice(begin, begin + _BLOCK)
     points = [np.asarray(scan, np.float64) for scan in recording.points[rows]]
-    speeds = [sign * np.asarray(values, np.float64) for values in recording.doppler_mps[rows]]
-    try:
+    speeds = [sign * np.asarray(values, np.float64) for values in (recording.doppler_mps or [])[rows]]
+    with contextlib.suppress(NoVelocityError):
         velocities = SensorVelocities.of(points, speeds, times_s[rows])
-    except NoVelocityError:
-        return
-    if offset_mps := radial_offset_mps(points, speeds, velocities):
-        evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
-        yield Finding("doppler_offset", "warning", evidence)
-    contradicted, clock = compare_with_poses(velocities, times_s[rows], recording.poses[rows])
-    if contradicted is not None and not known:
-        yield _contradiction(contradicted)
-    if contradicted is None and clock.note:
-        yield Finding("times_uneven", "warning", clock.note[0])
-
-
-def _contradiction(words: str) -> Finding:
-    return Finding("doppler_contradicts_poses", "warning", f"{words[0].upper()}{words[1:]}.")
+        if offset_mps := radial_offset_mps(points, speeds, velocities):
+            evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
+            yield Finding("doppler_offset", "warning", evidence)
+        tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
+        wrong = wrong or tested.contradiction
+        if tested.contradiction is None and tested.clock is not None and tested.clock.note:
+            yield Finding("times_uneven", "warning", tested.clock.note[0])
+    if wrong is not None:
+        yield Finding("doppler_contradicts_poses", "warning", f"{wrong[0].upper()}{wrong[1:]}.")
 
 
 def velocity_of_poses(T_world_sensor: Floats, times_s: Floats) -> Floats:
@@ -140,3 +133,91 @@ def velocity_of_poses(T_world_sensor: Floats, times_s: Floats) -> Floats:
     moves = step_vectors(T_world_sensor)
     between = np.einsum("fji,fj->fi", rotation(moves[:, 3:] / 2), moves[:, :3]) / np.diff(times_s)[:, None]
     return np.concatenate([between[:1], (between[1:] + between[:-1]) / 2, between[-1:]])
+
+
+_READ_AS = {  # factors of y and z, the name of the finding, and what completes "agree better if"
+    (1.0, -1.0): ("mounting_mirrored", "the sign of its elevation is changed"),
+    (-1.0, 1.0): ("mounting_mirrored", "the sign of its azimuth is changed"),
+    (-1.0, -1.0): ("mounting_upside_down", "it is mounted upside down"),
+}
+_PAIRS, _RETURNS, _QUERIES = 120, 2000, 200  # of scans, and returns of each
+_COMMON = 0.01  # standard deviation of the systematic error of velocities, share of the speed
+_SURE, _LOG_RATIO = 3.0, 8.0  # standard errors of the returns, and log likelihood ratio with the velocities
+_SURE_ALONE, _GAIN = 6.0, 0.05  # of the returns where velocities do not decide
+_ERRORS = 4.0  # standard deviations
+_LEAST = np.repeat([0.05, np.radians(0.5)], 3)  # of an error that degrades a map, m and rad
+
+
+def check_mountings(recording: Scans, config: FitConfig) -> Iterator[Finding]:
+    """Compare mountings with velocities by Doppler and with the surfaces that radars share. The poses must be rigid."""
+    given = recording.T_body_sensor
+    assert given is not None
+    try:
+        found = calibrate(recording, config=config)
+    except ValueError:  # there are no times, or the motion is not observable
+        return
+    for label, mounting in found.mountings.items():
+        off = increments(given[label][None], mounting.T_body_sensor[None])[0]
+        sigmas = np.sqrt(mounting.covariance.diagonal())
+        wrong = (np.abs(off) > _ERRORS * sigmas) & (np.abs(off) > _LEAST)  # False where unobserved
+        if wrong[3:].any():
+            degrees = np.degrees([np.linalg.norm(off[3:]), np.nanmax(sigmas[3:])])
+            evidence = "The rotation of {} differs by {:.1f} degrees from that found, with a deviation of {:.1f}, relative to {}."
+            yield Finding("mounting_rotation", "warning", evidence.format(label, *degrees, found.against))
+        if wrong[:3].any():
+            axis = int(np.nanargmax(np.where(wrong[:3], np.abs(off[:3]), 0.0)))
+            evidence = "The lever arm of {} along {} differs by {:.2f} m from that found, with a deviation of {:.2f}, relative to {}."
+            values = label, "xyz"[axis], abs(off[axis]), sigmas[axis], found.against
+            yield Finding("mounting_lever", "warning", evidence.format(*values))
+
+
+def misread_radars(recording: Scans) -> Iterator[tuple[Label, Finding]]:
+    """Find radars whose returns agree better with those of all scans, and with the poses, if axes are reversed."""
+    rig, poses = recording.rig, recording.sensor_poses
+    assert rig is not None
+    pairs = choose_pairs(recording.points, poses[:, :3, 3], _PAIRS)
+    if len(pairs) == 0:
+        return
+    agreement = Agreement(recording.points, _RETURNS, _QUERIES)
+    turns = np.array([np.diag([1.0, *factors, 1.0]) for factors in ((1.0, 1.0), *_READ_AS)])
+    for k, label in enumerate(rig.labels):
+        own = pairs[(rig.of_scan[pairs] == k).any(axis=1)]
+        if len(own) == 0:
+            continue
+        own_scans = (rig.of_scan == k)[:, None, None, None]
+        changed = np.where(own_scans, poses[:, None] @ turns, poses[:, None]).swapaxes(0, 1)
+        T_j_i = np.stack([np.linalg.inv(each[own[:, 1]]) @ each[own[:, 0]] for each in changed])
+        scores = agreement.scores(own, T_j_i)
+        comparison = Gain.over(scores[0], scores[1:])
+        by_doppler = _log_ratios(recording.select(np.flatnonzero(rig.of_scan == k)), turns[:, :3, :3])
+        evidence_of = comparison.significance**2 / 2 + by_doppler
+        both = (comparison.significance > _SURE) & (by_doppler > 1) & (evidence_of > _LOG_RATIO)
+        sure = comparison.significance > _SURE_ALONE
+        alone = sure & (comparison.mean > _GAIN) & (by_doppler > -_LOG_RATIO)
+        if not (both | alone).any():
+            continue
+        best = int(np.argmax(np.where(both | alone, comparison.significance + by_doppler, -np.inf)))
+        name, what = list(_READ_AS.values())[best]
+        evidence = (
+            f"Returns of {label} agree better with the other scans if {what} ({comparison.significance[best]:.0f} standard errors), "
+            f"and so do its velocities with the poses (log likelihood ratio {by_doppler[best]:.0f})."
+        )
+        yield label, Finding(name, "error", evidence)
+
+
+def _log_ratios(recording: Scans, turns: Floats) -> Floats:
+    """Log likelihood ratios (H - 1,) of mean velocities of a radar by Doppler, turned by `turns` (H, 3, 3), to those as they are."""
+    times_s = ascending_times_s(recording)
+    if recording.doppler_mps is None or times_s is None or len(recording) < 3:
+        return np.zeros(len(turns) - 1)
+    scans, found = velocities_of_some(recording, recording.doppler_mps)
+    by_poses = velocity_of_poses(recording.sensor_poses, times_s)[scans]
+    by_doppler = np.reshape([velocity.velocity_mps for velocity in found], (-1, 3))
+    speed = np.linalg.norm(by_poses, axis=1).mean()
+    if not np.isfinite(by_doppler).any() or speed == 0:
+        return np.zeros(len(turns) - 1)
+    # The sign of the Doppler is not known.
+    turned = np.einsum("hij,nj->hni", turns, by_doppler)
+    off = np.stack([np.nanmedian(sign * turned - by_poses, axis=1) for sign in (1.0, -1.0)])
+    squares = np.minimum((off / (_COMMON * speed)) ** 2, 100.0).sum(axis=2).min(axis=0)
+    return 0.5 * (squares[0] - squares[1:])

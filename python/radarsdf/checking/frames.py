@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Bools, Floats, Ints
-from radarsdf.checking.agreement import (
-    LAGS,
-    MIN_RETURNS,
-    STILL,
-    Agreement,
-    Comparison,
-    Hypothesis,
-    choose_pairs,
-    hypotheses,
-    pairs_apart,
-    relative,
-)
 from radarsdf.checking.recording import Finding, Severity, some_points
+from radarsdf.poses.agreement import LAGS, MIN_RETURNS, Agreement, Gain, choose_pairs, pairs_apart, relative
+from radarsdf.poses.rigid import assembled, turned_by
 from radarsdf.scans import Scans
 
 # Minimum gain of a note, as the mean logarithm of distances and in standard errors. The gain over standing still must
@@ -77,12 +67,12 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     motions = relative(poses, pairs)
     others = [guess.T_j_i for guess in guesses]
     scores = agreement.scores(pairs, np.stack([motions, *others, relative(poses, pairs[:, ::-1])]))
-    forwards = Comparison.of(scores[-1], scores[:1])
-    in_world = not (forwards.gains[0] > _FORWARDS_GAIN and forwards.significance[0] > _MIN_SIGNIFICANCE)
+    forwards = Gain.over(scores[-1], scores[:1])
+    in_world = not (forwards.mean[0] > _FORWARDS_GAIN and forwards.significance[0] > _MIN_SIGNIFICANCE)
     in_world = in_world and not _looks_out_of_its_frame(recording, pairs)
     best = _best(recording, pairs, guesses, scores[:-1], in_world)
     if best is None:
-        behind = -Comparison.of(scores[0], scores[1 : len(guesses) + 1]).significance
+        behind = -Gain.over(scores[0], scores[1 : len(guesses) + 1]).significance
         equal = {guess.finding for guess, sigmas in zip(guesses, behind, strict=True) if sigmas < _NOT_BEHIND}
         equal &= set(_UNDECIDED)
         if equal:
@@ -111,14 +101,10 @@ def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
         return
     agreement = Agreement(recording.points, effort.returns, effort.queries)
     # Neighbours, and scans half a recording apart.
-    scores = []
-    for lag in (1, max(1, len(usable) // 2)):
-        pairs = pairs_apart(usable, lag, effort.pairs // 2)
-        scores.append(agreement.scores(pairs, relative(recording.poses, pairs)[None])[0])
-    near, far = scores
-    change = float(far.mean() - near.mean())
-    few = min(len(near), len(far)) < _MIN_PAIRS
-    error = np.inf if few else float(np.sqrt(near.var(ddof=1) / len(near) + far.var(ddof=1) / len(far)))
+    pairs = [pairs_apart(usable, lag, effort.pairs // 2) for lag in (1, max(1, len(usable) // 2))]
+    near, far = (Gain.of_samples(agreement.scores(p, relative(recording.poses, p)[None])[0]) for p in pairs)
+    change = far.mean - near.mean
+    error = np.inf if min(near.count, far.count) < _MIN_PAIRS else np.hypot(near.error, far.error)
     moved = change > max(_MIN_GAIN, _MIN_SIGNIFICANCE * error)
     evidence = f"All {len(recording)} poses have the same position"
     if moved:
@@ -153,8 +139,8 @@ def _best(
         if best is not None and _severity(best[1], best[0].finding) == "error":
             return best
         noted = noted or best
-        comparison = Comparison.of(scores[0, used], scores[1:, used])
-        possible &= (comparison.gains > -_MIN_GAIN) | (comparison.significance > -_MIN_SIGNIFICANCE)
+        comparison = Gain.over(scores[0, used], scores[1:, used])
+        possible &= (comparison.mean > -_MIN_GAIN) | (comparison.significance > -_MIN_SIGNIFICANCE)
     return noted
 
 
@@ -162,28 +148,28 @@ def _best_of(
     guesses: list[Hypothesis], scores: Floats, possible: Bools, upright: Bools
 ) -> tuple[Hypothesis, float, float] | None:
     """:func:`_best` for pairs of scans at similar lags."""
-    comparison = Comparison.of(scores[0], scores[1:])
-    good = (comparison.gains >= _MIN_GAIN) & (comparison.significance >= _MIN_SIGNIFICANCE) & possible
+    comparison = Gain.over(scores[0], scores[1:])
+    good = (comparison.mean >= _MIN_GAIN) & (comparison.significance >= _MIN_SIGNIFICANCE) & possible
     # Returns come closer to each other, too, if the fields of view of two scans merely overlap more, most of all if the
     # sensor stands still. A hypothesis that explains the scans better than the data as they are also beats
     # that one. Measured: without this, 37 of 70 good recordings of 4 to 8 sparse scans had an error; with it, none of 258.
-    beats_still = Comparison.of(scores[1 + STILL], scores[1:]).gains >= _MIN_GAIN
+    beats_still = Gain.over(scores[1 + STILL], scores[1:]).mean >= _MIN_GAIN
     beats_still[STILL] = True
     good &= beats_still
     if not good.any():
         return None
-    top = int(np.argmax(np.where(good, comparison.gains, -np.inf)))
+    top = int(np.argmax(np.where(good, comparison.mean, -np.inf)))
     kinds = [guess.finding for guess in guesses]
-    behind = Comparison.of(scores[1:], scores[1 + top])
-    near = good & (comparison.gains >= _EQUAL * comparison.gains[top])
+    behind = Gain.over(scores[1:], scores[1 + top])
+    near = good & (comparison.mean >= _EQUAL * comparison.mean[top])
     near &= (behind.significance < _NOT_BEHIND) | (np.arange(len(guesses)) == top)
     # Scans that move on a plane agree equally well upside down.
     near = near & upright if (near & upright).any() else near
     # The most common of the mistakes with about equal gains; of its variants, the best one.
     kind = kinds[int(np.argmax(near))]
     of_kind = near & np.array([name == kind for name in kinds])
-    chosen = int(np.argmax(np.where(of_kind, comparison.gains, -np.inf)))
-    return guesses[chosen], float(comparison.gains[chosen]), float(comparison.significance[chosen])
+    chosen = int(np.argmax(np.where(of_kind, comparison.mean, -np.inf)))
+    return guesses[chosen], float(comparison.mean[chosen]), float(comparison.significance[chosen])
 
 
 def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
@@ -198,13 +184,123 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
     moved = [(scan - T[:3, 3]) @ T[:3, :3] for scan, T in zip(given, recording.poses[rows], strict=True)]
     first, second = np.searchsorted(rows, pairs.T)
     significances = []
-    for of_scan in (functools.partial(np.median, axis=0), _mean_direction):
-        before, after = (np.array([of_scan(scan) for scan in scans]) for scans in (given, moved))
+    both = [
+        [(x, x / np.maximum(np.linalg.norm(x, axis=1), 1e-12)[:, None]) for x in of] for of in (given, moved)
+    ]
+    for k, middle in enumerate((np.median, np.mean)):
+        before, after = (np.array([middle(scan[k], axis=0) for scan in scans]) for scans in both)
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
-        significances.append(steadier.mean() / (steadier.std(ddof=1) / np.sqrt(len(steadier)) + 1e-12))
+        significances.append(Gain.of_samples(steadier).significance)
     return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
 
 
-def _mean_direction(scan: Floats) -> Floats:
-    return (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)
+_UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}
+# Of radar axes (x forward, y left, z up) in a camera frame (x right, y down, z forward).
+_CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+# Mounting angles of a sensor on its vehicle: in yaw; in pitch up to 20.
+_TURNS_DEG = {"yaw": ("z", range(5, 50, 5)), "pitch": ("y", range(5, 25, 5))}
+# For larger turns between scans, poses in degrees may have been taken for radians.
+_FAST_RAD = np.radians(3)
+_LOST_TURNS = 29  # whole turns that are tried
+STILL = 1  # index of the hypothesis of a sensor that does not move between scans: points in the world frame
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A hypothetical interpretation of the data."""
+
+    finding: str  # name of the finding if the hypothesis is right
+    what: str  # completes "the scans agree better if"
+    T_j_i: Floats  # (P, 4, 4) motions between the frames of the original points of scan pairs
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # vertical axis in the frame of the original points
+
+
+def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) -> list[Hypothesis]:
+    """Hypotheses about rigid poses (F, 4, 4) for pairs (P, 2) of scans i and j, the more common mistakes first.
+
+    `all_axes`: whether to try all 47 permutations and reflections of axes, of points and positions, or the eight most common.
+    """
+    poses, motions = T_world_sensor, relative(T_world_sensor, pairs)
+
+    def positions(values: Floats) -> Floats:
+        return relative(assembled(poses[:, :3, :3], values), pairs)
+
+    def rotations(values: Rotation) -> Floats:
+        return relative(assembled(values.as_matrix(), poses[:, :3, 3]), pairs)
+
+    still = np.tile(np.eye(4), (len(pairs), 1, 1))
+    found = [
+        Hypothesis(
+            "poses_inverted",
+            "the poses are inverted",
+            relative(np.asarray(np.linalg.inv(poses), np.float64), pairs),
+        ),
+        Hypothesis("points_in_world_frame", "the points are in the world frame already", still),
+    ]
+    rotations_by_90 = Rotation.create_group("O").as_matrix().round()
+    # All permutations and reflections of axes but the identity.
+    for matrix in sorted([*rotations_by_90, *-rotations_by_90], key=_surprise)[1:]:
+        words = _written(matrix)
+        mirrored = np.array_equal(np.abs(matrix), np.eye(3)) and np.linalg.det(matrix) < 0
+        camera = any(np.array_equal(matrix, m) for m in (_CAMERA_OF_RADAR, _CAMERA_OF_RADAR.T))
+        kind = "camera_frame" if camera else "mirrored" if mirrored else "axes_swapped"
+        # z up or down, x and y in any order; and the camera frame
+        if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
+            continue
+        turned = assembled(matrix)
+        up = float(matrix[2, 0]), float(matrix[2, 1]), float(matrix[2, 2])
+        what = f"the points are read as ({words})"
+        found.append(Hypothesis(kind, what, turned.T @ motions @ turned, up))
+        if all_axes or not camera:
+            what = f"the positions of the poses are read as ({words})"
+            found.append(Hypothesis(kind, what, positions(poses[:, :3, 3] @ matrix.T)))
+    for factor, word in _UNITS.items():
+        what = f"the positions of the poses are multiplied by {word}"
+        found.append(Hypothesis("units", what, positions(poses[:, :3, 3] * factor)))
+    for what, angles in _angles(poses):
+        found.append(Hypothesis("angles_in_degrees", what, rotations(angles)))
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    for shift, order, other in ((-1, "w x y z", "x y z w"), (1, "x y z w", "w x y z")):
+        what = f"the quaternions of the poses are {order}, and were read as {other}"
+        rolled = Rotation.from_quat(np.roll(quaternions, shift, axis=1))
+        found.append(Hypothesis("quaternion_order", what, rotations(rolled)))
+    for name, (axis, turns) in _TURNS_DEG.items():
+        for degrees in (sign * turn for turn in turns for sign in (1, -1)):
+            T_vehicle_sensor = assembled(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+            what = f"the sensor is rotated by {degrees} degrees in {name} against the frame of the poses"
+            moved = T_vehicle_sensor.T @ motions @ T_vehicle_sensor
+            found.append(Hypothesis("sensor_turned", what, moved))
+    found.append(
+        Hypothesis("scans_exchanged", "the order of the scans is reversed", relative(poses[::-1], pairs))
+    )
+    return found
+
+
+def _written(matrix: Floats) -> str:
+    """Format a signed permutation as a user would write it: x, -y, -z."""
+    axes = np.argmax(np.abs(matrix), axis=1)
+    return ", ".join("-" * int(row[axis] < 0) + "xyz"[axis] for row, axis in zip(matrix, axes, strict=True))
+
+
+def _surprise(matrix: Floats) -> tuple[bool, bool, float]:
+    """Sort key of matrices: the identity first, then those that keep z up, a more common mistake, then few signs."""
+    key = matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum())
+    return not np.array_equal(matrix, np.eye(3)), *key
+
+
+def _angles(poses: Floats) -> Iterator[tuple[str, Rotation]]:
+    """Rotations (F,) as if their angles were in another unit, with a description."""
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    # Angles in rad taken for degrees are 57 times too small.
+    vectors = np.degrees(rotations.as_rotvec())
+    if np.linalg.norm(vectors, axis=1).max() < 2 * np.pi:
+        yield "the angles of the poses are taken for rad, not degrees", Rotation.from_rotvec(vectors)
+    if len(rotations) < 3 or np.median(turned_by(poses[:-1], poses[1:])) < _FAST_RAD:
+        return
+    # Angles in degrees taken for rad lost whole turns. Steps are small, so the turns between scans are known.
+    angles = np.radians(np.unwrap(rotations.as_euler("ZYX"), axis=0))
+    for turns in range(-_LOST_TURNS, _LOST_TURNS + 1):
+        lost = np.array([turns * np.radians(2 * np.pi), 0.0, 0.0])
+        what = "the angles of the poses are taken for degrees, not rad"
+        yield what, Rotation.from_euler("ZYX", angles + lost)

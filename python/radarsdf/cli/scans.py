@@ -26,7 +26,7 @@ from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 from radarsdf.io.meshes import MESH_SUFFIXES, holds_mesh, read_mesh, write_mesh
 from radarsdf.io.npz import write_scans
 from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
-from radarsdf.poses.posed import PosedScans
+from radarsdf.poses.odometry import PosedScans
 from radarsdf.render.figures import save_trajectory_picture
 from radarsdf.scans import Scans
 

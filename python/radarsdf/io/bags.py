@@ -18,12 +18,12 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
-from radarsdf.imu import Imu
 from radarsdf.io import bag_messages
 from radarsdf.io.bag_messages import Clock, Message, Topic, is_bag, read_messages, topics_with
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
 from radarsdf.io.poses import UNPOSED, NumberedPoses, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, poses_on, scan_poses
+from radarsdf.rig import Imu
 from radarsdf.scans import Scans
 
 # Topics of the radars in data sets, and of their poses. They take precedence over others.

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Array, Bytes
 from radarsdf.checks import AnyPath, check, instance, path_of
-from radarsdf.imu import Imu
 from radarsdf.io.files import check_regular_file, reading, whole_file
+from radarsdf.rig import Imu
 from radarsdf.scans import Scans
 
 # Measurements are mostly noise and compress by a factor of 2 to 5. A file of kilobytes could unpack to gigabytes.

@@ -21,6 +21,7 @@ from radarsdf.checks import (
     check,
     check_pose,
     check_poses,
+    interpolated_poses,
     path_of,
     pose_matrices,
     real_array,
@@ -78,11 +79,7 @@ class Trajectory:
 
     def poses(self, times_s: Floats) -> Floats:
         """Interpolate poses T_world_base (N, 4, 4) at times (N,), s, within the trajectory: linearly, and by slerp."""
-        poses = np.tile(np.eye(4), (len(times_s), 1, 1))
-        poses[:, :3, :3] = self._slerp(times_s).as_matrix()
-        for axis in range(3):
-            poses[:, axis, 3] = np.interp(times_s, self.times_s, self.positions[:, axis])
-        return poses
+        return interpolated_poses(times_s, self._slerp, self.positions)
 
     def pose_at(self, time_s: float, max_gap_s: float) -> Floats | None:
         """Interpolate the pose T_world_base (4, 4) at one time, s; None outside the trajectory and in longer gaps.

@@ -12,7 +12,6 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import AnyPath, check, check_pose, path_of, positions, positive
-from radarsdf.imu import checked_rotation
 from radarsdf.io import datasets, recordings
 from radarsdf.io import poses as pose_files
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
@@ -20,6 +19,7 @@ from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import READERS, read_points
 from radarsdf.io.fields import columns_of
 from radarsdf.io.npz import read_scans
+from radarsdf.rig import checked_rotation
 from radarsdf.scans import Notes, Scans
 
 

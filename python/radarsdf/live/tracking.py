@@ -15,25 +15,32 @@ import numpy as np
 from radarsdf.arrays import Floats
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog, rig_of_scans
-from radarsdf.poses.body import BodyVelocities
+from radarsdf.poses.agreement import CLEAR, ERRORS, sign_significance, turns_fast
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import (
-    CLEAR,
-    ERRORS,
     LEAST_MPS,
     NOT_USED,
+    BodyVelocities,
     NoVelocityError,
     SensorVelocities,
-    sign_significance,
-    turns_fast,
     upright,
 )
-from radarsdf.poses.drive import LEAST_OBSERVED, MOVES, TURNS, Drive, rates_of, track_drive
 from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.search import Lost
-from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begin_segment
+from radarsdf.poses.tracking import (
+    LEAST_OBSERVED,
+    MOVES,
+    TURNS,
+    WINDOW,
+    Drive,
+    Tracked,
+    Tracker,
+    begin_segment,
+    rates_of,
+    track_drive,
+)
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.rig import Label, Rig
 

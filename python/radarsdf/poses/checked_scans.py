@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import MAX_TIME_S, check, real_array, values_of_scans
-from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities, radial_offset_mps
+from radarsdf.poses.agreement import CLEAR, sign_significance, turns_fast
+from radarsdf.poses.doppler import (
+    NOT_USED,
+    BodyVelocities,
+    NoVelocityError,
+    SensorVelocities,
+    radial_offset_mps,
+)
 from radarsdf.returns.moving import without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Rig
@@ -27,14 +34,18 @@ _MOST_REACHES = 10.0  # maximum distance between two scans, median ranges: they 
 
 @dataclass(frozen=True)
 class CheckedScans:
-    """Validated scans of one drive, F of them."""
+    """Validated scans of one radar, or of a rig in the frame of its body, F of them."""
 
+    rows: Ints  # (F,) numbers among the scans of all radars
     scans: list[Floats]  # (N_i, 3) static returns, sensor frame, m
     times_s: Floats | None  # (F,) relative to the first scan of all radars
     begin_s: float  # time of that scan
     velocities: SensorVelocities | None  # from Doppler. None without Doppler, or if it yields no velocity
     moving: int  # number of moving returns left out
     notes: list[str]  # sentences on unused input
+    sign: int = 1  # -1 if its Doppler was positive for approaching objects
+    # (2, F - 1) rough yaws between scans of a sensor that turns fast, for the sign of the Doppler and its reverse. NaN if unknown.
+    yaws: Floats | None = None
 
     @classmethod
     def of(
@@ -45,45 +56,55 @@ class CheckedScans:
         check(fits, "Doppler needs times: the time of each scan (times_s), s")
         _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
-        if (range_m := median_range_m(scans)) > _MOST_M:
-            msg = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
-            raise ValueError(msg)
-        times_s, begin_s, notes = None, 0.0, left_out.notes
+        range_m = median_range_m(scans)
+        check(
+            range_m <= _MOST_M,
+            f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m",
+        )
+        rows, times_s, begin_s, notes = np.arange(len(scans)), None, 0.0, left_out.notes
         if times is not None:
             times_s = _checked_times(times, len(scans))
             begin_s = float(times_s[0])
             times_s, repeated = spread_times(times_s - begin_s)
             if repeated:
                 notes = [*notes, f"{repeated} scans repeat the previous time: they are spread evenly."]
+        unused = cls(rows, scans, times_s, begin_s, None, 0, notes)
         if doppler_mps is None or times_s is None:
-            return cls(scans, times_s, begin_s, None, 0, notes)
+            return unused
         speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
         notes = notes if filler is None else [*notes, f"{filler}."]
         try:
             velocities = SensorVelocities.of(scans, speeds, times_s)
         except NoVelocityError as why:
-            return cls(scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {why}."])
+            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
         if velocities.climb_assumed:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
         if offset_mps := radial_offset_mps(scans, speeds, velocities):
-            offset = f"{offset_mps:.2f} m/s are added to that of all returns"
-            return cls(scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {offset}."])
+            why = f"{offset_mps:.2f} m/s are added to that of all returns"
+            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
         moving = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
-        return cls(standing, times_s, begin_s, velocities, moving, notes)
+        return cls(rows, standing, times_s, begin_s, velocities, moving, notes)
 
     @classmethod
     def of_radars(
-        cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None
-    ) -> tuple[Rig | None, list[tuple[Ints, CheckedScans]]]:
-        """:meth:`of` for each radar: its scans (K,), checked; and the rig if there are several radars."""
+        cls,
+        points: _Points,
+        doppler_mps: Sequence[ArrayLike] | None,
+        times: ArrayLike | None,
+        *,
+        mounted: bool = True,
+    ) -> tuple[Rig | None, list[CheckedScans]]:
+        """:meth:`of` for each radar, and the rig if there are several, whose mountings must be known if `mounted`."""
         rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)
         if rig is None:
-            found = cls.of(points, doppler_mps, times)
-            return None, [(np.arange(len(found.scans)), found)]
-        check(rig.T_body_sensor is not None, "T_body_sensor is missing: the mounting of each radar")
+            return None, [cls.of(points, doppler_mps, times)]
+        check(
+            not mounted or rig.T_body_sensor is not None,
+            "T_body_sensor is missing: the mounting of each radar",
+        )
         times_s = None if times_ is None else _checked_times(times_, len(given))
         radars = []
         for rows in rig.scans_of_radars().values():
@@ -92,8 +113,18 @@ class CheckedScans:
             if checked.times_s is not None and times_s is not None:
                 since_s = checked.times_s + (checked.begin_s - times_s[0])
                 checked = dataclasses.replace(checked, times_s=since_s, begin_s=float(times_s[0]))
-            radars.append((rows, checked))
+            radars.append(dataclasses.replace(checked, rows=rows))
         return rig, radars
+
+    def signed(self) -> CheckedScans:
+        """Choose the sign of the Doppler with which neighbouring scans agree."""
+        if self.velocities is None or self.times_s is None:
+            return self
+        significance, yaws = sign_significance(self.scans, self.velocities, self.times_s)
+        sign = -1 if significance < -CLEAR else 1
+        velocities, yaws = self.velocities.scaled(sign), yaws[::sign]
+        known = yaws if turns_fast(yaws[0]) else None
+        return dataclasses.replace(self, velocities=velocities, sign=sign, yaws=known)
 
     def check_intervals(self) -> None:
         """Raise a ValueError if the times between scans cannot be in seconds."""
@@ -103,12 +134,29 @@ class CheckedScans:
         step_m = 0.0 if self.velocities is None else self.velocities.usual_mps * interval_s
         range_m = median_range_m(self.scans)
         low, high = _INTERVALS_S
-        if step_m > _MOST_REACHES * range_m or not low <= interval_s <= high:
-            msg = (
-                f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler, "
-                f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s"
-            )
-            raise ValueError(msg)
+        check(
+            step_m <= _MOST_REACHES * range_m and low <= interval_s <= high,
+            f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler, "
+            f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s",
+        )
+
+
+def join_radars(rig: Rig | None, radars: Sequence[CheckedScans]) -> CheckedScans:
+    """Return the scans of all radars in order, in the frame of the body."""
+    if rig is None:
+        return radars[0]
+    rows = np.concatenate([each.rows for each in radars])
+    order, scans = np.argsort(rows), [scan for each in radars for scan in each.scans]
+    known = [each.times_s for each in radars if each.times_s is not None]
+    # They need not ascend after a correction of those of one radar.
+    times_s = np.maximum.accumulate(np.concatenate(known)[order]) if known else None
+    measured = [(each.rows, each.velocities) for each in radars if each.velocities is not None]
+    velocities = None
+    if measured and times_s is not None:
+        velocities = BodyVelocities.of_radars(rig, measured, times_s)
+    scans, notes = rig.in_body([scans[i] for i in order]), [note for each in radars for note in each.notes]
+    moving = sum(each.moving for each in radars)
+    return CheckedScans(rows[order], scans, times_s, radars[0].begin_s, velocities, moving, notes)
 
 
 def spread_times(times_s: Floats) -> tuple[Floats, int]:

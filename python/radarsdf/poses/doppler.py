@@ -1,19 +1,18 @@
-"""Velocities of the sensor from Doppler, and the motion between scans that they imply."""
+"""Velocities of a sensor, or of the body of several, from Doppler, and the motion between scans that they imply."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
-from radarsdf.poses.motion import KnownMotion, spans_of, turned_halfway, usual_duration_s, way
-from radarsdf.poses.rigid import rotation, rotation_vector, step_vectors, steps
+from radarsdf.poses.motion import KnownMotion, MotionRate, interpolate, spans_of, usual_duration_s, way
+from radarsdf.poses.rigid import rotation_vector, skew, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import (
     MIN_DOPPLER_RETURNS,
@@ -21,21 +20,8 @@ from radarsdf.returns.moving import (
     folding_interval_mps,
     sensor_velocities,
 )
+from radarsdf.rig import Rig
 
-_SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
-_FEW_SAMPLED = 100  # returns of a scan, where many pairs are compared
-_FIRST_PAIRS = 12
-_FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
-YAW_STEP_RAD = 0.07
-"""Resolution of the yaws between neighbouring scans."""
-_TURNS_RAD = YAW_STEP_RAD * np.arange(-6, 7)
-_TURNS, _HALF_TURNS = (rotation(np.multiply.outer(share * _TURNS_RAD, [0.0, 0.0, 1.0])) for share in (1, 0.5))
-CLEAR = 4.0
-"""Standard errors by which scans must agree better with one sign of the Doppler."""
-LEAST_M = 0.05
-"""Minimum distance between returns that counts, m, below the noise of any radar."""
-ERRORS = 3.0
-"""Standard errors of a significant difference."""
 # Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
 # elevations with a common error.
 LEAST_MPS = 0.02
@@ -151,14 +137,11 @@ def radial_offset_mps(
             continue
         away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
         columns = np.column_stack([-away, np.ones(len(away))])
-        normal = normal_matrix(columns, columns)
-        if np.linalg.cond(normal) > 1e6:
-            continue
-        inverse = np.linalg.inv(normal)
-        fitted = np.einsum("ij,nj,n->i", inverse, columns, speeds[used])
-        spread = float(((speeds[used] - np.einsum("ni,i->n", columns, fitted)) ** 2).sum()) / (used.sum() - 4)
-        offsets.append(float(fitted[3]))
-        variances.append(max(spread, _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
+        fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
+        if rank == 4:
+            inverse = np.linalg.inv(normal_matrix(columns, columns))
+            offsets.append(float(fitted[3]))
+            variances.append(max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
     if len(offsets) < _FEWEST_OFFSETS:
         return 0.0
     weights = 1 / np.array(variances)
@@ -204,8 +187,8 @@ class DopplerMotion(KnownMotion):
         spans = spans_of(times_s, len(times_s))
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
-        unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
-        return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
+        measured = velocities, durations_s, turns
+        return cls(steps(poses), shares, spans, *measured, bias_sigma=common).at(poses)
 
     def at(self, poses: Floats) -> DopplerMotion:
         return self.turned(steps(poses)[:, :3, :3])
@@ -215,9 +198,7 @@ class DopplerMotion(KnownMotion):
         between, (begin, end, levers) = self.steps.copy(), self.velocities.of_steps
         between[:, :3, :3] = rotations
         turns = rotation_vector(rotations, self.turns)
-        between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None])
-        if levers is not None:
-            between[:, :3, 3] += turned_halfway(turns, np.einsum("fij,fj->fi", levers, turns))
+        between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None], levers)
         return dataclasses.replace(self, steps=between)
 
     def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
@@ -228,87 +209,121 @@ class DopplerMotion(KnownMotion):
         return both
 
 
-class _Pair:
-    """Two scans, whose returns are compared with the nearest one of the other."""
-
-    def __init__(self, first: Floats, second: Floats, sampled: int = _SAMPLED) -> None:
-        self._trees = cKDTree(first), cKDTree(second)
-        self._sampled = [scan[:: max(1, len(scan) // sampled)] for scan in (first, second)]
-
-    def log_distances(self, turn: Floats, shifts_m: Floats) -> Floats:
-        """Return log distances (K, M) to the nearest returns, if the second scan is turned by (3, 3) and shifted by (K, 3)."""
-        # Queries are turned back, since trees are dearer.
-        first, second = self._sampled
-        of_second = self._trees[0].query(second @ turn.T + shifts_m[:, None])[0]
-        of_first = self._trees[1].query((first - shifts_m[:, None]) @ turn)[0]
-        return np.log(np.maximum(np.concatenate([of_second, of_first], axis=1), LEAST_M))
+_ANY_MPS, _TURN_RAD_S = 100.0, 0.3  # prior deviations of a component of a velocity and of a turn rate
+_LEAST_S = 1e-6  # of a step, against division by zero
 
 
-def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
-    """Return mean log distances (K,) to the nearest returns of scans in common axes, the second after shifts (K, 3)."""
-    return _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), shifts_m).mean(axis=1)
+@dataclass(frozen=True)
+class BodyVelocities(SensorVelocities):
+    """Velocities of the radars of a rig, in the axes of its body, and those of the body that follow from them.
 
+    If the body moves at v and turns at ω, a radar at the lever arm l moves at v + ω x l. Each radar measures each step of the
+    body, by its scans before and after it: together they measure the turn, too, if their lever arms differ.
+    """
 
-def sign_significance(
-    scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats
-) -> tuple[float, Floats]:
-    """Return the standard errors by which scans agree better with velocities than reversed, and the yaws (2, F - 1) for both."""
-    durations_s = np.diff(times_s)
-    moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
-    usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
-    usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
-    # The longest steps are most informative: if the first are twice as clear as needed, the others are not compared, unless
-    # the sensor turns so fast that each yaw is needed.
-    pairs = sorted(np.flatnonzero(usable).tolist(), key=lambda i: -float(moved_m[i] @ moved_m[i]))
-    yaws = np.full((2, len(durations_s)), np.nan)
-    gains, significance = [], 0.0
-    for some in (pairs[:_FIRST_PAIRS], pairs[_FIRST_PAIRS:_PAIRS], pairs[_PAIRS:]):
-        for i in some:
-            gain, yaws[:, i] = _reversal_gains(scans[i], scans[i + 1], moved_m[i])
-            gains.append(gain)
-        significance = _significance(gains) if gains else 0.0
-        clear = abs(significance) > 2 * CLEAR or len(gains) >= min(_PAIRS, len(pairs))
-        if clear and not turns_fast(yaws[int(significance < 0)]):
-            break
-    return significance, yaws
+    of_radars_mps: Floats = field(kw_only=True)  # (K, F - 1, 3) velocity of each radar in each step
+    variances: Floats = field(kw_only=True)  # (K, F - 1, 3, 3) m²/s²
+    levers: Floats = field(kw_only=True)  # (K, 3, 3) cross-product matrices of the lever arms, m
+    # Whether the radars agree in the mean. Two on a motorway differ by 0.4 m/s in the vertical, which would be 5 degrees a second
+    # of pitch: before, they do not measure turns.
+    agree: bool = False
 
+    @classmethod
+    def of_radars(
+        cls, rig: Rig, measured: Sequence[tuple[Ints, SensorVelocities]], times_s: Floats
+    ) -> BodyVelocities:
+        """Build from the scans (N,) of each radar with Doppler and its velocities at them. `times_s` (F,): of all scans."""
+        count, mountings = len(rig.of_scan), rig.mountings
+        mean, covariance = np.zeros((count, 3)), np.tile(_ANY_MPS**2 * np.eye(3), (count, 1, 1))
+        durations_s, middles_s = np.maximum(np.diff(times_s), _LEAST_S), (times_s[:-1] + times_s[1:]) / 2
+        of_radars_mps, variances, changes = [], [], []
+        for rows, velocities in measured:
+            R, own_s = mountings[rows[0], :3, :3], times_s[rows]
+            mean[rows] = velocities.mean_mps @ R.T
+            covariance[rows] = R @ velocities.covariance @ R.T
+            changes.append(np.square(R) @ velocities.change)
+            of_radars_mps.append(interpolate(middles_s, own_s, mean[rows]))
+            after = np.clip(np.searchsorted(own_s, middles_s), 1, max(len(rows) - 1, 1))
+            before, after = rows[after - 1], rows[np.minimum(after, len(rows) - 1)]
+            # The errors of two scans of a radar are those of all steps between them, in proportion to their durations.
+            apart_s = np.maximum(times_s[after] - times_s[before], durations_s)
+            beyond_s = np.maximum(np.maximum(own_s[0] - middles_s, middles_s - own_s[-1]), 0.0)
+            change = np.multiply.outer(apart_s**2 / 12 / durations_s + beyond_s, np.diag(changes[-1]))
+            ends = (covariance[before] + covariance[after]) / 4
+            variances.append(ends * (apart_s / durations_s)[:, None, None] + change)
+        return cls(
+            mean,
+            covariance,
+            np.min(changes, axis=0),  # they include the noise of each radar
+            [np.zeros(0, bool)] * count,  # moving returns were left out before
+            np.ones(count, bool),
+            common_sigma=max(velocities.common_sigma for _, velocities in measured),
+            clock_sigma_s=max(velocities.clock_sigma_s for _, velocities in measured),
+            of_radars_mps=np.stack(of_radars_mps),
+            variances=np.stack(variances),
+            levers=skew(np.stack([mountings[rows[0], :3, 3] for rows, _ in measured])),
+        )
 
-def turns_fast(yaws: Floats) -> bool:
-    """Return whether yaws (F - 1,) between scans, NaN if unknown, are beyond those that tracking expects of an unknown sensor."""
-    known = np.abs(yaws[np.isfinite(yaws)])
-    return bool(len(known) and np.median(known) > YAW_STEP_RAD)
+    def select(self, rows: slice | Ints) -> Self:
+        """Select consecutive scans; of others, velocities without those of steps."""
+        found = super().select(rows)
+        steps = slice(rows.start, rows.stop - 1) if isinstance(rows, slice) else slice(0)
+        of_radars_mps, variances = self.of_radars_mps[:, steps], self.variances[:, steps]
+        return dataclasses.replace(found, of_radars_mps=of_radars_mps, variances=variances)
 
+    def learnt(self, turn_rates: Sequence[MotionRate | None]) -> BodyVelocities:
+        """Remove the mean difference of each radar from the others, given turn rates (F - 1), rad/s; None: unknown."""
+        rows = np.array([i for i, rate in enumerate(turn_rates) if rate is not None], np.int64)
+        if len(rows) == 0:
+            return self
+        rates = np.stack([rate.mean for rate in turn_rates if rate is not None])
+        mean_mps, _, levers = self.of_steps
+        body_mps = mean_mps[rows] + np.einsum("fij,fj->fi", levers[rows], rates)
+        off = self.of_radars_mps[:, rows] - body_mps + np.einsum("kij,fj->kfi", self.levers, rates)
+        information = self._information[:, rows]
+        sums = np.einsum("kfij,kfj->ki", information, off)
+        biases = np.linalg.solve(information.sum(axis=1), sums[:, :, None])[:, :, 0]
+        return dataclasses.replace(self, of_radars_mps=self.of_radars_mps - biases[:, None], agree=True)
 
-def _significance(gains: Sequence[Floats]) -> float:
-    """Return the mean gain of pairs of scans, from those of their returns, in standard errors."""
-    means = np.array([gain.mean() for gain in gains])
-    if len(gains) < _FEW_PAIRS:
-        # Returns of both scans count, mostly on the same objects: half of them are independent.
-        variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
-    else:
-        variance = means.var(ddof=1) / len(gains)
-    return float(means.mean() / np.sqrt(max(variance, 1e-12)))
+    @cached_property
+    def _information(self) -> Floats:
+        return np.asarray(np.linalg.inv(self.variances), np.float64)
 
+    @cached_property
+    def _weights(self) -> tuple[Floats, Floats]:
+        """Weights (K, F - 1, 3, 3) of the radars in the velocity of a step, and its covariances (F - 1, 3, 3)."""
+        variances = np.linalg.inv(self._information.sum(axis=0))
+        return variances @ self._information, variances
 
-def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Iterable[Floats]) -> float:
-    """Return by how many standard errors pairs of scans agree better after `motions` (4, 4) than after their rotations alone."""
-    # Negative where a pattern that moves with the sensor, such as that of a straight wall, explains the returns better.
-    gains = [
-        _Pair(first, second).log_distances(motion[:3, :3], np.outer([0.0, 1.0], motion[:3, 3])).mean(axis=1)
-        for (first, second), motion in zip(pairs, motions, strict=True)
-        if min(len(first), len(second)) > 0
-    ]
-    if len(gains) < _FEW_PAIRS:
-        return 0.0
-    still, moved = np.transpose(gains)
-    return float((still - moved).mean() / max((still - moved).std(ddof=1) / np.sqrt(len(gains)), 1e-6))
+    @cached_property
+    def of_steps(self) -> tuple[Floats, Floats, Floats]:
+        weights, _ = self._weights
+        mean = np.einsum("kfij,kfj->fi", weights, self.of_radars_mps)
+        return mean, mean, np.einsum("kfij,kjl->fil", weights, self.levers)
 
+    def step_covariance(self, i: int, duration_s: float) -> Floats:
+        """Return the covariance (3, 3) of the step from scan `i`, m²."""
+        covariance: Floats = self._weights[1][i] * duration_s**2
+        clock = 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
+        return covariance + clock
 
-def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> tuple[Floats, tuple[float, float]]:
-    """Return how much nearer each return (M,) is after this motion than after its reverse, each with its best yaw, and these."""
-    pair, both = _Pair(first, second), []
-    for whole, half in zip(_TURNS, _HALF_TURNS, strict=True):
-        both.append(pair.log_distances(whole, np.multiply.outer([1.0, -1.0], half @ moved_m)))
-    ahead, back = np.swapaxes(both, 0, 1)
-    i, j = int(ahead.mean(axis=1).argmin()), int(back.mean(axis=1).argmin())
-    return back[j] - ahead[i], (float(_TURNS_RAD[i]), float(_TURNS_RAD[j]))
+    def turn_given(self, turn: MotionRate, i: int, duration_s: float) -> MotionRate:
+        """Return a turn (rad) in the step from scan `i`, given the differences of the velocities of the radars."""
+        mean_mps, _, levers = self.of_steps
+        if duration_s == 0 or not self.agree:
+            return turn
+        apart = (self.levers - levers[i]) / duration_s
+        information = self._information[:, i]
+        off = mean_mps[i] - self.of_radars_mps[:, i] - apart @ turn.mean
+        # In the information form, of a turn that may be known exactly.
+        total = np.einsum("kji,kjl,klm->im", apart, information, apart)
+        covariance = turn.covariance @ np.linalg.inv(np.eye(3) + total @ turn.covariance)
+        gradient = np.einsum("kji,kjl,kl->i", apart, information, off)
+        return MotionRate(turn.mean + covariance @ gradient, covariance)
+
+    def measure_turns(self, durations_s: Floats, least: float) -> bool:
+        """Whether these velocities remove at least this share of the variance of yaws between scans."""
+        usual = MotionRate(np.zeros(3), _TURN_RAD_S**2 * np.eye(3))
+        steps = [(i, usual.integrate(d), d) for i, d in enumerate(durations_s.tolist()) if d > 0]
+        left = [self.turn_given(turn, i, d).covariance[2, 2] / turn.covariance[2, 2] for i, turn, d in steps]
+        return bool(np.median(left) <= 1 - least)

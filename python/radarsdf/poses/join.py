@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import time
 from collections.abc import Sequence
@@ -13,13 +14,11 @@ import numpy as np
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.body import MeasuredScans, join_radars
-from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.estimate import PosesEstimate
+from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.odometry import odometry
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.refine import FIRST_SIGMAS
+from radarsdf.poses.refine import FIRST_SIGMAS, PosesEstimate
 from radarsdf.poses.rigid import aligned
 from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
 from radarsdf.scans import Scans
@@ -115,8 +114,7 @@ class _Session:
     def of(cls, session: Scans, config: FitConfig) -> _Session:
         instance(session, Scans, "a session")
         rig, radars = CheckedScans.of_radars(session, None, None)
-        static = [MeasuredScans(rows, checked.scans, checked.times_s, None) for rows, checked in radars]
-        scans = join_radars(rig, static).scans
+        scans = join_radars(rig, [dataclasses.replace(checked, velocities=None) for checked in radars]).scans
         poses, rows = session.poses, np.arange(len(session))
         if not np.isfinite(poses).all():
             motion = odometry(session, config=config, progress=False)

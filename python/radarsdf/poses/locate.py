@@ -14,18 +14,16 @@ from numpy.typing import ArrayLike
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.imu import Imu
 from radarsdf.map.map import Map
-from radarsdf.poses.drive import Drive
-from radarsdf.poses.estimate import WEAK, PosesEstimate
 from radarsdf.poses.odometry import track_scans
-from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.registration import PlaneMap, thin
+from radarsdf.poses.planes import PlaneMap, SensorReturns, least_certain, plane_cell_m, thin
+from radarsdf.poses.refine import WEAK, PosesEstimate
 from radarsdf.poses.rigid import covariance_in, increments, skew, transform
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near, search_scans
-from radarsdf.poses.tracking import Tracked
+from radarsdf.poses.tracking import Drive, Tracked
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
+from radarsdf.rig import Imu
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
@@ -123,14 +121,14 @@ def locate(
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     start = None if guess is None else check_pose(guess, "guess")
     with ThreadPool(config.num_threads) as pool:
-        drive, tracked, *_, notes = track_scans(
+        drive, tracked, *_, checked = track_scans(
             points, doppler_mps, times_s, imu, config, pool.num_threads, progress
         )
         count = len(tracked)
         poses, covariance = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
         explained, segments = np.full(count, np.nan), np.full(count, -1)
         why: list[Lost] = []
-        localiser = _Localiser(index, drive, tracked, config, pool.num_threads, notes)
+        localiser = _Localiser(index, drive, tracked, config, pool.num_threads, checked.notes)
         of_scans = np.array([found.segment for found in tracked])
         parts = [np.flatnonzero(of_scans == segment) for segment in range(of_scans[-1] + 1)]
         while parts:
@@ -152,7 +150,7 @@ def locate(
         "verdict": _summarize(segments, explained),
         "found": int((segments >= 0).sum()),
         "lost": [str(each) for each in why],
-        "notes": notes,
+        "notes": checked.notes,
         "seconds": time.perf_counter() - begin,
     }
     return Localisation(poses, covariance, explained, segments, report)
@@ -264,7 +262,7 @@ class _Localiser:
                 points, mean = thin(np.concatenate(near)), correction @ own
                 registered = planes.fit(points, mean, prior)
                 # Along the least certain axis, a step by chance is discounted as its information is.
-                axis, pose = registered.least_certain, registered.pose.copy()
+                axis, pose = least_certain(registered.covariance), registered.pose.copy()
                 pose[:3, 3] -= (1 - registered.observed[0]) * (axis @ (pose - mean)[:3, 3]) * axis
                 both = np.stack([mean, pose])
                 agreeing = planes.fine.scores(points, both, planes.variances).mean(axis=1).tolist()

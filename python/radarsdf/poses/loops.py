@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radarsdf.arrays import Floats, Ints
+from radarsdf.poses.agreement import NEIGHBOURS, Gain, density, median_apart_m
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.verdict import NEIGHBOURS, Verdict, density, median_apart_m
 from radarsdf.returns.noise import SensorNoise
 
 _MOST_RETURNS = 50_000  # maximum number of returns compared
@@ -49,8 +49,8 @@ def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_
         floor = float(np.median([here, shifted]))
         if floor == 0:  # they see different surfaces
             continue
-        agreement = Verdict.by_groups(np.log((here + floor) / (shifted + floor)), returns.scans[rows])
-        if agreement.parts >= _FEWEST_SCANS and agreement.gain < _ERRORS * agreement.error:
+        agreement = Gain.by_groups(np.log((here + floor) / (shifted + floor)), returns.scans[rows])
+        if agreement.count >= _FEWEST_SCANS and agreement.mean < _ERRORS * agreement.error:
             now, then = (f"scans {of[0] + first_scan} to {of[-1] + first_scan}" for of in (later, earlier))
             what = f"their returns agree no better there than {shift_m:.1f} m to the side"
             notes.append(f"A loop is open: {now} seem to be where {then} were, but {what}.")

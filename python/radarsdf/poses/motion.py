@@ -89,17 +89,17 @@ class MotionRate:
 Priors = tuple[MotionPrior, MotionPrior]  # translation, rotation
 
 
-def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats) -> Floats:
+def way(
+    turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats, levers: Floats | None = None
+) -> Floats:
     """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
-    and linearly changing velocity."""
-    middle = turned_halfway(turn, 0.5 * (begin_mps + end_mps))
-    end = np.einsum("...ij,...j->...i", rotation(turn), end_mps)
-    return duration_s / 6 * (begin_mps + 4 * middle + end)
+    and linearly changing velocity. `levers` (..., 3, 3): its derivative by the turn, if radars have lever arms, m."""
 
+    def turned(share: float, vectors: Floats) -> Floats:
+        return np.einsum("...ij,...j->...i", rotation(share * turn), vectors)
 
-def turned_halfway(turn: Floats, vectors: Floats) -> Floats:
-    """Rotate vectors (..., 3) of the middle of a step to its beginning."""
-    return np.einsum("...ij,...j->...i", rotation(0.5 * turn), vectors)
+    moved = duration_s / 6 * (begin_mps + 4 * turned(0.5, 0.5 * (begin_mps + end_mps)) + turned(1.0, end_mps))
+    return moved if levers is None else moved + turned(0.5, np.einsum("...ij,...j->...i", levers, turn))
 
 
 @dataclass(frozen=True)
@@ -117,10 +117,7 @@ class PredictedStep:
     def pose(self, turn: Floats | None = None) -> Floats:
         """Return the pose (..., 4, 4) after rotation vectors `turn` (..., 3). None: the predicted one."""
         turn = self.turn.mean if turn is None else turn
-        found = transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s))
-        if self.lever is not None:
-            found[..., :3, 3] += turned_halfway(turn, np.einsum("ij,...j->...i", self.lever, turn))
-        return found
+        return transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s, self.lever))
 
     def covariance(self, turn: Floats | None = None) -> Floats:
         """Return the covariance (6, 6) of translation and rotation vector, in the first frame, correlated by the turn."""
@@ -178,10 +175,12 @@ class Motion:
     """Motions between neighbouring scans measured by one source: given poses, Doppler, or a gyroscope."""
 
     steps: Floats  # (F - 1, 4, 4)
-    bias: Floats  # (6,) bias of a step: translation, m, rotation vector, rad, in the sensor frame
-    variances: Floats  # (2,) of a component of a step's translation, m², and rotation, rad², at share 1
-    shares: Floats  # (F - 1, 6) factors of these variances. Infinite for components that are not measured
+    shares: Floats  # (F - 1, 6) factors of the variances. Infinite for components that are not measured
     spans: Floats  # (F - 1,) duration of each step relative to the median, to which biases are proportional
+    # (2,) of a component of a step's translation, m², and rotation, rad², at share 1
+    variances: Floats = field(default_factory=lambda: np.ones(2), kw_only=True)
+    # (6,) bias of a step: translation, m, rotation vector, rad, in the sensor frame
+    bias: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
     # (6,) standard deviation of the systematic part of the bias, not observable from this source.
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
 
@@ -191,7 +190,7 @@ class Motion:
         spans = spans_of(times_s, len(poses))
         shares = np.repeat(spans[:, None], 6, axis=1)
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
-        return cls(steps(poses), np.zeros(6), variances, shares, spans)
+        return cls(steps(poses), shares, spans, variances=variances)
 
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
         """Relinearise at poses (F, 4, 4). Most measurements do not depend on them."""
@@ -281,8 +280,7 @@ class SteadyMotion(KnownMotion):
         spans = spans_of(times_s, len(times_s))
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
-        unknown = np.zeros(6), np.ones(2), shares, spans
-        return cls(steps(poses), *unknown, priors, duration_s * spans, duration_s**2 * usual).at(poses)
+        return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 
     def at(self, poses: Floats) -> SteadyMotion:
         """Predict each step of `poses` from its neighbours."""
@@ -298,7 +296,9 @@ class SteadyMotion(KnownMotion):
     def evidence(self) -> Motion:
         """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""
         shares = np.where(np.isinf(self.shares), np.inf, self.spans[:, None])
-        return Motion(self.steps, self.bias, self.usual, shares, self.spans, bias_sigma=self.bias_sigma)
+        return Motion(
+            self.steps, shares, self.spans, variances=self.usual, bias=self.bias, bias_sigma=self.bias_sigma
+        )
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
@@ -329,3 +329,8 @@ def usual_duration_s(durations_s: Floats) -> float:
     """Return the median of those durations that are positive: radars of a rig may measure at once. 0 if there are none."""
     positive = durations_s[durations_s > 0]
     return float(np.median(positive)) if len(positive) else 0.0
+
+
+def interpolate(times_s: Floats, at_s: Floats, values: Floats) -> Floats:
+    """Interpolate values (G, 3) at ascending times (G,) linearly at `times_s` (F,)."""
+    return np.stack([np.interp(times_s, at_s, column) for column in values.T], 1)

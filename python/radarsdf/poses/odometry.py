@@ -1,4 +1,4 @@
-"""Radar odometry: poses of scans from returns, Doppler and an IMU."""
+"""Radar odometry: poses of scans from returns, Doppler and an IMU; and poses, refined or estimated, for maps and reports."""
 
 from __future__ import annotations
 
@@ -14,20 +14,18 @@ from numpy.typing import ArrayLike
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.imu import Imu
-from radarsdf.poses.body import BodyVelocities, MeasuredScans, join_radars
-from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.agreement import ERRORS, motion_significance
+from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance, turns_fast
-from radarsdf.poses.drive import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
-from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.gyroscope import UnusableGyroscopeError
-from radarsdf.poses.imu import Inertial, level_poses
+from radarsdf.poses.doppler import NOT_USED, BodyVelocities
+from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.rigid import steps
-from radarsdf.poses.tracking import Tracked
+from radarsdf.poses.refine import PosesEstimate, RefinedPoses
+from radarsdf.poses.rigid import lengths_of_steps_m, steps
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, Tracked, track_drive
 from radarsdf.returns.rays import within_ranges
+from radarsdf.rig import Imu
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
@@ -125,31 +123,33 @@ def odometry(
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     with ThreadPool(config.num_threads) as pool:
-        drive, tracked, compared, inertial, notes = track_scans(
+        drive, tracked, compared, inertial, scans = track_scans(
             points, doppler_mps, times_s, imu, config, pool.num_threads, progress
         )
-        velocities = drive.velocities
+        velocities, notes = drive.velocities, scans.notes
         notes += _check_observed(tracked, drive, notes)
         segments = np.array([found.segment for found in tracked])
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
         if velocities is not None:
-            covariance = widened(compared, poses, covariance, segments, drive)
+            known = [(each.rows, tested) for each, tested in compared if each.velocities is not None]
+            # Radars of a rig move together: the best known one decides.
+            rows, least = min(known, key=lambda radar: len(radar[1].doubts or ()))
+            covariance = least.widened(rows, poses, covariance, segments, drive)
         if inertial.alignment is not None:
             poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
-    lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    length_m = float(lengths_m[np.diff(segments) == 0].sum())
+    length_m = float(lengths_of_steps_m(poses)[np.diff(segments) == 0].sum())
     gyroscope = drive.gyroscope
     report = {
         "verdict": _summarize(segments, length_m, velocities is not None, inertial),
         "length_m": length_m,
         "segments": int(segments[-1]) + 1,
         "doppler": velocities is not None,
-        "doppler_sign": compared[0].sign,
+        "doppler_sign": scans.sign,
         "gyroscope": gyroscope is not None,
         "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
-        "imu": inertial.report,
-        "moving": sum(each.moving for each in compared),
+        "imu": None if inertial.alignment is None else inertial.alignment.report,
+        "moving": scans.moving,
         "notes": notes,
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
@@ -162,9 +162,9 @@ class TrackedScans(NamedTuple):
 
     drive: Drive
     tracked: list[Tracked]
-    compared: list[ComparedRadar]
+    compared: list[tuple[CheckedScans, Consistency]]  # of each radar
     inertial: Inertial
-    notes: list[str]
+    scans: CheckedScans  # of all radars
 
 
 def track_scans(
@@ -178,81 +178,45 @@ def track_scans(
 ) -> TrackedScans:
     """Check scans, compare their Doppler with their returns, and track them. Arguments and errors are those of :func:`odometry`."""
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
-    for _, checked in radars:
+    for checked in radars:
         if checked.times_s is None:
             msg = "times_s are missing: the time of each scan, s"
             raise ValueError(msg)
         checked.check_intervals()
     if imu is None and isinstance(points, Scans):
         imu = points.imu
-    compared = [_compare_doppler(rows, checked, config, num_threads) for rows, checked in radars]
-    _, scans, times, velocities = join_radars(rig, [each.measured for each in compared])
+    compared = [_compare_doppler(checked.signed(), config, num_threads) for checked in radars]
+    scans = join_radars(rig, [each for each, _ in compared])
+    times, velocities = scans.times_s, scans.velocities
     assert times is not None
-    notes = [note for each in compared for note in each.notes]
     # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
-    of_radars = [each.measured.rows for each in compared if each.measured.velocities is not None]
+    of_radars = [each.rows for each, _ in compared if each.velocities is not None]
     radar = max(of_radars, key=len, default=np.arange(len(times)))
     own = None if velocities is None else velocities.select(radar)
-    inertial = Inertial.of(imu, own, times, radars[0][1].begin_s, radar)
-    yaws = compared[0].yaws if rig is None else None
-    drive = Drive(scans, times, velocities, inertial.gyroscope, yaws=yaws, rig=rig)
+    inertial = Inertial.of(imu, own, times, scans.begin_s, radar)
+    drive = Drive(scans.scans, times, velocities, inertial.gyroscope, yaws=scans.yaws, rig=rig)
     try:
         drive, tracked = track_drive(drive, config, num_threads, progress)
     except UnusableGyroscopeError as why:
         inertial = inertial.without(why)
         drive = dataclasses.replace(drive, gyroscope=None)
         drive, tracked = track_drive(drive, config, num_threads, progress)
-    return TrackedScans(drive, tracked, compared, inertial, [*notes, *inertial.notes])
+    scans.notes.extend(inertial.notes)
+    return TrackedScans(drive, tracked, compared, inertial, scans)
 
 
-class ComparedRadar(NamedTuple):
-    """A radar, whose Doppler was compared with its returns."""
-
-    measured: MeasuredScans
-    yaws: Floats | None  # see :class:`Drive`
-    sign: int
-    consistency: Consistency
-    moving: int  # number of moving returns left out
-    notes: list[str]
-
-
-def widened(
-    compared: Sequence[ComparedRadar], poses: Floats, covariance: Floats, segments: Ints, drive: Drive
-) -> Floats:
-    """Widen covariances (F, 6, 6) of poses by what Doppler and returns leave open."""
-    known = [each.consistency for each in compared if each.measured.velocities is not None]
-    # Radars of a rig move together: the best known one decides.
-    least = min(known, key=lambda one: len(one.doubts or ()))
-    return least.widened(poses, covariance, segments, drive)
-
-
-def _compare_doppler(rows: Ints, checked: CheckedScans, config: FitConfig, num_threads: int) -> ComparedRadar:
-    times_s, velocities, sign, yaws = checked.times_s, checked.velocities, 1, None
-    assert times_s is not None
-    if velocities is not None:
-        significance, both = sign_significance(checked.scans, velocities, times_s)
-        if significance < -CLEAR:
-            sign, both, velocities = -1, both[::-1], velocities.scaled(-1.0)
-        yaws = both if turns_fast(both[0]) else None
-    limits, notes = config.returns, [*checked.notes]
+def _compare_doppler(
+    checked: CheckedScans, config: FitConfig, num_threads: int
+) -> tuple[CheckedScans, Consistency]:
+    """Compare the Doppler of a radar with its returns within the ranges of the settings."""
+    limits = config.returns
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-    drive = Drive(scans, times_s, velocities, None, yaws=yaws)
-    consistency = Consistency.of_returns(drive, config, num_threads)
-    if velocities is not None:
-        velocities, tested = consistency.applied(velocities)
-        notes += tested
-        if velocities is not None and (clock := consistency.clock) is not None:
-            times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
-            velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
-    measured = MeasuredScans(rows, scans, times_s, velocities)
-    return ComparedRadar(
-        measured,
-        None if velocities is None else yaws,
-        sign,
-        consistency.of_scans(rows),
-        checked.moving,
-        notes,
-    )
+    checked = dataclasses.replace(checked, scans=scans)
+    if checked.velocities is None or checked.times_s is None:
+        return checked, Consistency()
+    drive = Drive(scans, checked.times_s, checked.velocities, None, yaws=checked.yaws)
+    tested = Consistency.of_returns(drive, config, num_threads)
+    return tested.corrected(checked), tested
 
 
 def _estimate_jointly(
@@ -304,8 +268,7 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
     if drive.velocities is None:
         within = np.flatnonzero(np.diff([found.segment for found in tracked]) == 0)
         motions = steps(np.stack([found.pose for found in tracked]))[within]
-        pairs = [(drive.scans[i], drive.scans[i + 1]) for i in within]
-        if (significance := motion_significance(pairs, motions)) < -ERRORS:
+        if (significance := motion_significance(drive.scans, within, motions)) < -ERRORS:
             refuse("moved", "scans agree better without any motion", doppler)
         if significance < ERRORS:
             what = "neighbouring scans agree as well without any motion"
@@ -327,3 +290,77 @@ def _summarize(segments: Ints, length_m: float, doppler: bool, inertial: Inertia
         lost = f"The drive was lost before the scans {', '.join(map(str, begins))}"
         sentences.append(f"{lost}: {len(begins) + 1} segments, which do not belong together.")
     return " ".join(sentences)
+
+
+_MOST = 500  # maximum number of poses in a report: enough for a plot
+
+
+def pose_sigmas(covariance: Floats) -> tuple[float, float]:
+    """Compute median standard deviations per axis of the position, m, and rotation, rad, of poses.
+
+    `covariance` (F, 6, 6) is that of :class:`RefinedPoses` or :class:`Odometry`. These are the values for
+    ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of a :class:`FitConfig`.
+    """
+    position_m, turn_rad = np.median(_sigmas(covariance), axis=0).tolist()
+    return position_m, turn_rad
+
+
+def _sigmas(covariance: Floats) -> Floats:
+    """Return standard deviations (F, 2) of positions, m, and rotations, rad, root mean square of the three axes."""
+    variances = np.einsum("fii->fi", covariance).reshape(-1, 2, 3).mean(axis=2)
+    return np.sqrt(np.maximum(variances, 0.0))
+
+
+def trajectory_report(
+    found: RefinedPoses | Odometry, given: Floats | None, rows: slice = slice(None)
+) -> dict[str, Any]:
+    """Return the trajectory of the scans `rows` for the report of a fit, as JSON values. `given` (F, 4, 4): original poses."""
+    poses = found.poses[rows]
+    some = np.unique(np.linspace(0, len(poses) - 1, min(_MOST, len(poses))).astype(np.int64))
+    sigmas = _sigmas(found.covariance[rows])[some]
+    return {
+        "verdict": found.report["verdict"],
+        "improved": found.improved if isinstance(found, RefinedPoses) else None,
+        "step_m": found.report.get("sigma_m"),
+        "step_rad": found.report.get("sigma_rad"),
+        "scans": some.tolist(),
+        "before": None if given is None else given[rows][some, :3, 3].tolist(),
+        "after": poses[some, :3, 3].tolist(),
+        "sigma_m": sigmas[:, 0].tolist(),
+        "sigma_rad": sigmas[:, 1].tolist(),
+    }
+
+
+@dataclass(frozen=True)
+class PosedScans:
+    """Poses of the scans to fit a map to."""
+
+    poses: Floats  # (K, 4, 4) T_world_sensor, m
+    rows: slice  # the K scans among those of the drive: all, or the longest segment of odometry
+    given: Floats | None = None  # (K, 4, 4) original poses, if any
+    segments: int = 1
+    trajectory: dict[str, Any] | None = None  # for the report of a map. None for original poses
+    sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
+    notes: tuple[str, ...] = ()  # sentences on unused input
+
+    @classmethod
+    def refined(cls, refined: RefinedPoses, given: Floats) -> PosedScans:
+        """Build from refined poses and the original ones (F, 4, 4). `sigmas` are unknown if these were kept."""
+        sigmas = pose_sigmas(refined.covariance) if refined.improved else None
+        rows, notes = slice(0, len(given)), tuple(refined.report.get("notes", ()))
+        return cls(refined.poses, rows, given, 1, trajectory_report(refined, given), sigmas, notes)
+
+    @classmethod
+    def found(cls, found: Odometry) -> PosedScans:
+        """Build from the longest segment of odometry."""
+        rows, report = found.longest_segment(), found.report
+        sigmas, trajectory = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
+        segments, notes = report["segments"], tuple(report["notes"])
+        return cls(found.poses[rows], rows, None, segments, trajectory, sigmas, notes)
+
+    def config(self, config: FitConfig) -> FitConfig:
+        """Return `config` with the errors of the poses, unless it specifies its own."""
+        if self.sigmas is None or config.returns.pose_sigma_m or config.returns.pose_sigma_rad:
+            return config
+        sigma_m, sigma_rad = self.sigmas
+        return config.override(returns={"pose_sigma_m": sigma_m, "pose_sigma_rad": min(sigma_rad, 1.0)})

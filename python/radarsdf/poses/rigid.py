@@ -27,6 +27,11 @@ def steps(poses: Floats) -> Floats:
     return between(poses[:-1], poses[1:])
 
 
+def lengths_of_steps_m(poses: Floats) -> Floats:
+    """Return the distances (F - 1,) from each pose to the next."""
+    return np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+
+
 def step_vectors(poses: Floats) -> Floats:
     """Return the translations, m, and rotation vectors, rad, (F - 1, 6) of :func:`steps`."""
     motions = steps(poses)

@@ -20,8 +20,7 @@ from radarsdf.checks import check
 from radarsdf.io.files import reading
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.map.map import Map
-from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.registration import PlaneMap, apart_m
+from radarsdf.poses.planes import PlaneMap, SensorReturns, apart_m
 from radarsdf.poses.rigid import rotation, transform
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from radarsdf.arrays import Floats, Floats32
 from radarsdf.checks import check_poses, positive, real_array
-from radarsdf.imu import Imu, checked_rotation
 from radarsdf.poses.rigid import moved, steps
+from radarsdf.rig import Imu, checked_rotation
 
 from .radar import generator
 from .simulation import Simulation
