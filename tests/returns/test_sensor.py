@@ -1,7 +1,6 @@
 """A sensor is what its scans show: noise along the beam, in azimuth and in elevation, ranges and angles."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -56,11 +55,6 @@ def test_a_sensor_of_rays_is_that_of_scans():
     for name in ("azimuth_rad", "elevation_rad", "range_m", "returns_per_scan"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name), abs=1e-5)
     np.testing.assert_allclose(found.thresholds, expected.thresholds, atol=1e-4)
-
-
-def test_json_keeps_a_sensor():
-    sensor = Sensor.of(*scans(), noise=NOISE)
-    assert Sensor.from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
 
 
 def test_numbers_at_their_limits_and_beyond_the_thresholds():
