@@ -190,19 +190,6 @@ def test_config_prints_a_file_that_reproduces_the_configuration(capsys, tmp_path
     assert capsys.readouterr().out == path.read_text()
 
 
-@pytest.mark.parametrize(
-    ("setting", "named"),
-    [
-        ("training.colour=1", "training.colour"),
-        ("seed.a=1", "seed"),
-        ("training.sigma_cells=-1", "training.sigma_cells must be greater than 0, not -1"),
-        ("networks.intensity_hidden=wide", "networks.intensity_hidden"),
-    ],
-)
-def test_invalid_settings_are_rejected(capsys, tmp_path, setting, named):
-    assert named in refusal(capsys, tmp_path, "config", "--set", setting)
-
-
 def test_options_are_the_parameters_of_read(tmp_path):
     (tmp_path / "scans").mkdir()
     for i in range(4):
