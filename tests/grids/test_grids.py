@@ -5,7 +5,7 @@ import pytest
 import radarsdf
 from radarsdf.cli import main
 from radarsdf.grids.grid import Grid, Wheels
-from radarsdf.grids.occupancy import _crossed, _touched
+from radarsdf.grids.occupancy import _touched
 
 from scenes.kinds import KINDS
 
@@ -238,14 +238,6 @@ def test_a_plane_occupies_adjacent_voxels_by_its_position_error():
         share = (np.abs(distance_m) < 0.5 * size * normal.sum()).mean()  # whether the plane crosses the cube
         assert found[tuple(voxel)] == pytest.approx(0.8 * share, abs=0.012)
     assert np.count_nonzero(found) <= 27
-
-
-def test_a_surface_lies_between_the_voxels_on_both_sides():
-    distance_m = np.array([0.4, 0.1, -0.15, -0.2, np.nan, 0.05, 0.3, -0.6, -0.1, 0.12], np.float32)
-    expected = [False, True, True, False, False, False, True, False, True, True]
-    for axis in range(3):
-        line = distance_m.reshape([-1 if i == axis else 1 for i in range(3)])
-        assert _crossed(line, 0.15).ravel().tolist() == expected
 
 
 def in_map_server(path):
