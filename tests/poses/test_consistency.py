@@ -37,6 +37,17 @@ def motion(street):
     return measured_motion(street, seed=5)
 
 
+@pytest.fixture(scope="module")
+def tunnel():
+    return KINDS["tunnel"](seed=5, frames=20)
+
+
+@pytest.fixture(autouse=True)
+def right_frames(monkeypatch):
+    """Hypotheses on frames and axes, which take most of the time of a check, are tested in tests/checking."""
+    monkeypatch.setattr("radarsdf.checking.frames.check_frames", lambda *_: [])
+
+
 def odometry(street, speeds, times_s):
     found = radarsdf.odometry(street.points, doppler_mps=speeds, times_s=times_s, progress=False)
     middle = len(street.poses) // 2
@@ -117,8 +128,7 @@ def test_a_changed_sign_of_a_sensor_that_turns_fast_is_found(factor):
 
 
 @pytest.mark.parametrize("fault", ["sign from half", "zero from half"])
-def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(fault):
-    tunnel = KINDS["tunnel"](seed=5, frames=20)
+def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(tunnel, fault):
     motion = measured_motion(tunnel, seed=5)
     speeds = [factor * values for factor, values in zip(FACTORS[fault], motion.doppler_mps, strict=True)]
     found, worst = odometry(tunnel, speeds, motion.times_s)
