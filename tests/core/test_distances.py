@@ -207,15 +207,6 @@ def test_cells_along_rays_are_the_cells_crossed():
             assert max(ends[0].max(), -reach_m) <= min(ends[1].min(), reach_m)
 
 
-def test_a_longer_reach_crosses_all_cells_of_a_shorter_one():
-    points, directions, *_ = some_rays(5000, spread_m=300.0)
-    short, far = (keys_along(points, directions, reach_m) for reach_m in (0.4, 0.6))
-    assert np.isin(short, far).all()
-    assert len(far) > len(short)
-    for num_threads in (1, 3):
-        np.testing.assert_array_equal(far, keys_along(points, directions, 0.6, num_threads))
-
-
 @pytest.mark.parametrize("num_levels", [1, 3])
 def test_vertices_of_leaf_cells(num_levels):
     points, directions, *_ = some_rays(300)
