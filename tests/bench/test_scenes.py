@@ -113,12 +113,6 @@ def test_errors_are_positive_in_front_and_negative_behind():
     np.testing.assert_allclose(errors([[-0.5, 2, 1], [-0.1, 2, 1]], -X), [0.2, -0.2], atol=1e-6)
 
 
-def test_ground_near_walls_and_foundations_is_the_surface():
-    # Next to the wall; and 5 cm below the ground, 10 cm in front of the foundation, which is no surface.
-    np.testing.assert_allclose(errors([[0.1, 0, 0.1], [0.1, 0, -0.05]], Z), [0.1, -0.05], atol=1e-6)
-    np.testing.assert_allclose(errors([4.0 - 0.15, 0, 1.0], -X), [0.05], atol=1e-6)
-
-
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (5e5, 5.4e6, 120.0)], ids=["local", "UTM"])
 def test_planes_through_noisy_points(offset):
     rng = np.random.default_rng(0)

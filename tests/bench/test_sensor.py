@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
@@ -82,21 +81,3 @@ def drive(simulation):
 
 def test_the_simulation_is_as_noisy_as_the_drives(drive):
     assert misfits(figures(drive)) == {}
-
-
-@pytest.mark.parametrize(
-    ("changes", "what_fails", "is_too_large"),
-    [
-        ({"sigma_elevation_rad": 0.004}, "deviation elevation rad 10-20", False),  # as in azimuth
-        ({"weak_noise": 0.0}, "deviation beam, strong / weak 30-45", True),
-        ({"phantoms_per_scan": 0.0}, "share farther than 1 m 30-45", False),
-        ({"sidelobe_share": 0.3}, "share farther than 1 m 10-20", True),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
-)
-def test_each_part_of_the_noise_is_needed(simulation, drive, changes, what_fails, is_too_large):
-    sensor = replace(simulation.sensor, **changes)
-    changed = simulate(simulation.scene, sensor, simulation.poses, name=simulation.name, seed=SEED)
-    wrong = misfits(figures(with_lidar(changed, same_lidar=drive)))
-    assert what_fails in wrong
-    assert (wrong[what_fails] > 1) == is_too_large
