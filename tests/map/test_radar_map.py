@@ -47,23 +47,6 @@ def test_sensor_positions_broadcast(sharp_map):
     assert not np.allclose(each, one, atol=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(3,), (5, 2), (5, 4), (2, 5, 3), ()])
-def test_wrong_shapes(query, shape):
-    _, function = query
-    with pytest.raises(ValueError, match=r"positions must have shape \(N, 3\)"):
-        function(np.zeros(shape))
-    with pytest.raises(ValueError, match=r"positions must have shape \(N, 3\)"):
-        function(torch.zeros(shape))
-
-
-def test_empty_queries(query):
-    name, function = query
-    for empty in (np.zeros((0, 3)), torch.zeros(0, 3)):
-        answer = function(empty)
-        assert tuple(answer.shape) == ((0, 3) if name == "gradient" else (0,))
-        assert type(answer) is type(empty)
-
-
 def test_a_nan_point_does_not_affect_others(query):
     name, function = query
     x = near_surface(9)
