@@ -15,7 +15,7 @@ from radarsdf.poses.doppler import (
 )
 from radarsdf.poses.drive import Drive, rates_of
 from radarsdf.poses.gyroscope import Gyroscope
-from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
+from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, way
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.posed import PosedScans, pose_sigmas
 from radarsdf.poses.registration import apart_m
@@ -118,19 +118,6 @@ def test_an_uncertain_bias_has_the_derivatives_of_the_gradient():
         assert_allclose(by[k], slope, atol=1e-9)
         spans2 = motion.spans**2 / motion.shares[:, axis]
         assert own[k] == pytest.approx(spans2.sum() * sigma[axis] ** 2 / [0.1**2, 0.02**2][axis // 3])
-
-
-def test_spans_and_unsteady_steps():
-    times_s = np.array([0.0, 1, 2, 2, 5])
-    assert_allclose(spans_of(times_s, 5), [1, 1, 0.001, 3])  # two radars measure at once
-    assert_array_equal(spans_of(None, 3), [1, 1])
-    assert_array_equal(spans_of(np.zeros(3), 3), [1, 1])
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, 0, 3] = [0, 1, 3, 4, 6]  # steps of 1 and 2 m
-    assert unsteadiness(poses, None) == pytest.approx((np.sqrt(1 / 2 / 3), 0))
-    assert unsteadiness(poses, np.array([0.0, 1, 3, 4, 6])) == pytest.approx((0, 0))
-    assert unsteadiness(poses[:2], None) == (0, 0)
-    assert unsteadiness(poses[:3], None)[0] > 0
 
 
 def test_climbs_equal_a_kalman_update():

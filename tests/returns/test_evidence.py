@@ -194,15 +194,6 @@ def added(rays, max_cells, leaf_keys=None):
     return set(np.setdiff1d(result, leaf_keys).tolist())
 
 
-def test_badly_supported_and_dense_ends_are_not_bridged():
-    block = [(x, y, 0) for x in range(3) for y in range(3)]
-    lone = (4, 1, 0)
-    assert added(rays_to([*block, lone]), 1) == set()  # one return, against a median of five
-    assert len(added(rays_to([*block, lone, lone, lone]), 1)) == 1
-    for count, bridges in ((int(_MAX_SUPPORT) - 1, 1), (int(_MAX_SUPPORT), 0)):
-        assert len(added(rays_to([(0, 0, 0), (2, 0, 0)], count), 1)) == bridges
-
-
 @pytest.mark.parametrize("max_cells", [1, 2, 4, 9])
 def test_bridges_equal_a_search_of_all_pairs(max_cells):
     rng = np.random.default_rng(max_cells)

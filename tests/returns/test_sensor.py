@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.returns.evidence import ReturnsOfCells, VisibilityCounts
+from radarsdf.returns.evidence import ReturnsOfCells
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
@@ -161,10 +161,3 @@ def test_errors_of_poses_are_common_to_the_returns_of_a_scan():
             returns.with_uncertain_poses(ranges_m, ReturnsConfig(**{name: 0.01})).information
             < returns.information
         ).all()
-
-
-def test_visibility_is_counted_in_blocks():
-    counts = VisibilityCounts(np.array([2, 5], np.uint64), np.array([7, 9], np.uint32))
-    leaves = np.array([0, 2 << 9, (2 << 9) + 511, 3 << 9, 5 << 9, 6 << 9], np.uint64)
-    assert counts.at(leaves).tolist() == [0, 7, 7, 0, 9, 0]
-    assert VisibilityCounts(counts.keys[:0], counts.scans[:0]).at(leaves).tolist() == [0] * 6

@@ -280,11 +280,3 @@ def test_reflector_lobe_in_the_wall_scene():
 def test_impossible_sensors_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         sim.RadarSensor(**wrong)
-
-
-def test_an_empty_world_returns_nothing():
-    simulation = sim.simulate(sim.Scene([]), QUIET, np.eye(4)[None], name="void")
-    assert simulation.world_points().shape == (0, 3)
-    assert simulation.ground_truth.shape == (0, 3)
-    assert np.isnan(simulation.intensity_noise_floor())
-    assert len(simulation) == 1
