@@ -113,13 +113,13 @@ def _child(library: Path) -> None:
     many = few.select(np.arange(_MANY) % len(few))
     leaf_keys = near_leaf_keys(few, FitConfig(), 1)
     for name, rays, sizes in (
-        ("geometry", few, {"batch_size": 2048}),
-        ("joint", few, {"batch_size": 2048}),
-        ("intensity", few, {"sdf_iterations": 1}),
+        ("geometry", few, {"batch_size": 512}),
+        ("joint", few, {"batch_size": 512, "intensity_batch_size": 256}),
+        ("intensity", few, {"sdf_iterations": 1, "intensity_batch_size": 256}),
         ("few returns", few, {"batch_size": 64}),
         ("many returns", many, {"batch_size": 64}),
     ):
-        iterations = {"sdf_iterations": _STEPS + 3, "intensity_iterations": _STEPS + 3}
+        iterations = {"sdf_iterations": _STEPS + 2, "intensity_iterations": _STEPS + 2}
         config = FitConfig(num_threads=1, training=iterations | sizes)
         scale = IntensityScale.of(rays.intensities) if name in ("joint", "intensity") else None
         with ThreadPool(1) as pool:

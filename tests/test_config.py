@@ -14,7 +14,6 @@ from pydantic import ValidationError
 from radarsdf import FitConfig, _core
 from radarsdf.config import groups
 from radarsdf.config.fit_config import flat_settings
-from radarsdf.lattice import WorldLattice
 from radarsdf.settings import first_wrong
 
 TINY, LARGE = sys.float_info.min, 1e300
@@ -245,16 +244,3 @@ def test_presets():
     assert quick.closes_intensity
     assert not quick.trains_intensity
     assert FitConfig().trains_intensity
-
-
-def test_settings_of_the_preparation():
-    ranges = {"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3}
-    assert FitConfig(returns=ranges).preparation == ranges | {"lattice": WorldLattice(0.2, 32)}
-
-
-def test_rows_move_unless_normals_are_learnt_with_the_geometry():
-    assert FitConfig().moves_rows(with_intensity=True)
-    assert not FitConfig(training={"optimiser": "adam"}).moves_rows(with_intensity=False)
-    normals = FitConfig(networks={"normals": True})
-    assert normals.moves_rows(with_intensity=False)
-    assert not normals.moves_rows(with_intensity=True)

@@ -95,20 +95,20 @@ def test_missing_packages_are_named_with_an_install_command(monkeypatch):
     assert require("json", what="it takes").loads("1") == 1
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_the_core_shares_the_openmp_runtime_of_pytorch():
-    # This module imports the core, but not PyTorch.
-    run(
-        "import radarsdf; radarsdf.marching_cubes;"
-        "lines = open('/proc/self/maps').read().splitlines();"
-        "libraries = {line.split()[-1] for line in lines if any(x in line for x in ('gomp', 'iomp', 'libomp'))};"
-        "assert len(libraries) == 1, libraries"
-    )
+OPENMP = """
+import sys, radarsdf
+radarsdf.marching_cubes  # whose module imports the core, but not PyTorch
+if sys.platform == "linux":
+    lines = open("/proc/self/maps").read().splitlines()
+    libraries = {line.split()[-1] for line in lines if any(x in line for x in ("gomp", "iomp", "libomp"))}
+    assert len(libraries) == 1, libraries
+import radarsdf.threads, radarsdf.evaluation
+"""
 
 
-def test_an_unknown_instruction_set_is_a_warning():
+def test_the_core_shares_the_openmp_runtime_of_pytorch_and_names_unknown_instruction_sets_once():
     done = subprocess.run(
-        [sys.executable, "-c", "import radarsdf.threads, radarsdf.evaluation"],
+        [sys.executable, "-c", OPENMP],
         env=os.environ | {"RADARSDF_ISA": "nonsense"},
         capture_output=True,
         text=True,

@@ -79,13 +79,6 @@ def test_settings_of_users_change_no_bit(few, tmp_path, usual, setting, config):
     assert found == usual[config]
 
 
-@pytest.mark.parametrize("number", [1, 16])
-def test_any_number_of_threads_gives_the_same_bits(few, tmp_path, usual, number):
-    with changed(torch.set_num_threads, number, torch.get_num_threads()):
-        assert answers(few, tmp_path / "map.safetensors", {}) == usual["core"]
-        assert torch.get_num_threads() == number
-
-
 @pytest.mark.parametrize("size", [1, 3])
 def test_small_batches_give_a_finite_map(few, tmp_path, size):
     small = {"batch_size": size, "intensity_batch_size": size, "sdf_iterations": 3, "intensity_iterations": 6}

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from bench.paper.calibration import compared
-from bench.paper.surface import sampled
 from bench.truth import along_normals
 from scenes.scene import load_scene
 
@@ -49,17 +47,3 @@ def test_false_surface_and_unknown_points_are_shares(scene, surface):
     assert row["coverage_95"] == pytest.approx(0.95, abs=0.01)  # of the other points
     assert row["num_points"] + row["num_unknown"] == 6000
     assert row["confidence_auc"] > 0.95
-
-
-def test_samples_lie_on_the_mesh_and_have_its_normals():
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=2.0)
-    x, normals = sampled(ball, 20_000, None)
-    assert len(x) == 20_000
-    np.testing.assert_allclose(np.linalg.norm(x, axis=1), 2, atol=0.03)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
-    assert (np.einsum("ij,ij->i", normals, x) / 2 > 0.98).all()
-    assert np.abs(x.mean(axis=0)).max() < 0.05  # balanced
-    upper, _ = sampled(ball, 20_000, np.array([[-3.0, -3, 0], [3, 3, 3]]))
-    assert upper[:, 2].min() >= 0
-    assert len(upper) == pytest.approx(10_000, rel=0.05)
-    assert len(sampled(trimesh.Trimesh(), 100, None)[0]) == 0

@@ -132,21 +132,6 @@ def test_map_size_of_the_octree_is_the_reference(tmp_path):
 
 
 @pytest.mark.usefixtures("peers")
-def test_curve_alternates_budgets_settings_and_peers(tmp_path):
-    words = ("curve", "wall", "--peers", "BPA", "radarsdf", "--repetitions", "2", "--samples", "1000")
-    _, values = run(tmp_path, *words, "--set", "encoding.kind=octree", "encoding.bridge_cells=2")
-    methods = [
-        "radarsdf, × 1/16",
-        "radarsdf, intensities, × 1/16",
-        "encoding.kind=octree, encoding.bridge_cells=2",
-        "BPA",
-    ]
-    assert [row["method"] for row in values["rows"]] == 2 * methods
-    assert values["rows"][3]["seconds"] == 4.0  # of the scans that are not held out
-    assert (tmp_path / "paper-curve.png").stat().st_size > 1000
-
-
-@pytest.mark.usefixtures("peers")
 def test_kinds_have_scores_and_a_calibration(tmp_path):
     table, values = run(tmp_path, "kinds", "wall", "--peers", "BPA", "Poisson", "--samples", "3000")
     assert "- wall: Open3D is not here" in table

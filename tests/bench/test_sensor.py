@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 from radarsdf.simulate import SCENES, simulate
-from scipy.spatial import cKDTree
 
-from bench.sensor import Drive, deviation, figures, plane_errors, with_lidar
+from bench.sensor import figures, with_lidar
 
 SEED = 2  # a scene that agrees with the drives on its own; other seeds agree in the median
 
@@ -84,44 +81,3 @@ def drive(simulation):
 
 def test_the_simulation_is_as_noisy_as_the_drives(drive):
     assert misfits(figures(drive)) == {}
-
-
-@pytest.mark.parametrize(
-    ("changes", "what_fails", "is_too_large"),
-    [
-        ({"sigma_elevation_rad": 0.004}, "deviation elevation rad 10-20", False),  # as in azimuth
-        ({"weak_noise": 0.0}, "deviation beam, strong / weak 30-45", True),
-        ({"phantoms_per_scan": 0.0}, "share farther than 1 m 30-45", False),
-        ({"sidelobe_share": 0.3}, "share farther than 1 m 10-20", True),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
-)
-def test_each_part_of_the_noise_is_needed(simulation, drive, changes, what_fails, is_too_large):
-    sensor = replace(simulation.sensor, **changes)
-    changed = simulate(simulation.scene, sensor, simulation.poses, name=simulation.name, seed=SEED)
-    wrong = misfits(figures(with_lidar(changed, same_lidar=drive)))
-    assert what_fails in wrong
-    assert (wrong[what_fails] > 1) == is_too_large
-
-
-def test_plane_errors_are_residuals_along_the_normal():
-    """A wall 20 m ahead, normal to the beam, far from the world origin."""
-    rng = np.random.default_rng(0)
-    aside = np.array([4e5, 5e6, 100.0])
-    wall = np.column_stack([np.full(4000, 20.0), rng.uniform(-3, 3, (4000, 2))]) + aside
-    points = np.column_stack([20.0 + rng.normal(0, 0.2, 300), rng.uniform(-1, 1, (300, 2))])
-    pose = np.eye(4)
-    pose[:3, 3] = aside
-    frame = np.zeros(300, np.int64)
-    drive = Drive("wall", points, np.ones(300), frame, pose[None], wall, np.zeros(4000, np.int64))
-    world = drive.world_points()
-    errors_m, axis = plane_errors(drive, world, cKDTree(wall).query(world)[1])
-    assert (axis == 0).all()
-    assert np.abs(errors_m) == pytest.approx(np.abs(points[:, 0] - 20.0), abs=1e-6)
-
-
-def test_deviation_ignores_a_background():
-    rng = np.random.default_rng(0)
-    errors = np.concatenate([rng.normal(0, 0.1, 2000), rng.uniform(-1.5, 1.5, 1000)])
-    assert deviation(errors, 1.5) == pytest.approx(0.1, rel=0.08)
-    assert np.isnan(deviation(errors[:10], 1.5))

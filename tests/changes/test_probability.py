@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from radarsdf.changes.alignment import Alignment, _Surface
 from radarsdf.changes.changes import (
     APPEARED,
     GONE,
@@ -21,7 +20,6 @@ from radarsdf.changes.changes import (
 from radarsdf.changes.compare import _classify
 from radarsdf.changes.probability import (
     Errors,
-    PlacedMap,
     PlaceEvidence,
     Side,
     _free_space_odds,
@@ -30,7 +28,6 @@ from radarsdf.changes.probability import (
     share_of_changes,
 )
 from radarsdf.changes.reflectance import Differences, _Means
-from radarsdf.poses.rigid import transform
 from scipy.integrate import quad
 from scipy.stats import beta, norm
 from scipy.stats import t as student
@@ -165,24 +162,6 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     assert _classify(unsure, odds, 0.5, GONE).kind[0] in (SAME, UNSEEN)
 
 
-def test_means_of_a_neighbourhood_are_weighted():
-    rng = np.random.default_rng(2)
-    means = _Means(rng.uniform(0, 3, (200, 3)), rng.normal(0, 5, 200), rng.uniform(0.5, 4, 200))
-    x = np.concatenate([rng.uniform(0, 3, (20, 3)), [[90.0, 0, 0]]])
-    found = np.stack(means.near(x, 0.8), axis=1)
-    for place, (mean, sigma, chi2, freedom) in zip(x, found, strict=True):
-        near = np.linalg.norm(means.points - place, axis=1) <= 0.8
-        if not near.any():
-            assert np.isnan(mean)
-            assert (chi2, freedom) == (0, 0)
-            continue
-        weights, values = 1 / means.variances[near], means.values[near]
-        assert mean == pytest.approx(np.average(values, weights=weights))
-        assert sigma == pytest.approx(weights.sum() ** -0.5)
-        assert chi2 == pytest.approx((weights * (values - mean) ** 2).sum(), abs=1e-9)
-        assert freedom == near.sum() - 1
-
-
 def test_reflectance_changes_only_if_all_views_agree():
     """Nine views of five places: equal, stronger, stronger but contradictory, contradictory on a day, near a change."""
     rng = np.random.default_rng(3)
@@ -250,25 +229,3 @@ def test_regions_areas_and_colours_of_changes():
     assert_array_equal(mesh.faces[8:], [[16, 17, 18], [16, 18, 19], [20, 21, 22], [20, 22, 23]])
     green, purple = (mesh.visual.vertex_colors[row, :3].tolist() for row in (13, 8))
     assert (green, purple) == ([0, 158, 115], [204, 121, 167])
-
-
-def test_frames_of_maps_and_their_errors():
-    T = transform(np.array([0.1, -0.2, 0.7]), np.array([3.0, -2, 1]))
-    x = np.random.default_rng(4).normal(0, 3, (50, 3))
-    placed = PlacedMap(None, T, x, np.zeros((0, 3), np.int32), np.tile([0.6, 0, 0.8], (50, 1)), np.zeros(50))
-    assert_allclose(placed.to_common(x), x @ T[:3, :3].T + T[:3, 3])
-    assert_allclose(placed.to_own(placed.to_common(x)), x)
-    near_m, rows, off_m = placed.nearest(x + [0.01, 0.02, 0])
-    assert_allclose(near_m, np.hypot(0.01, 0.02))
-    assert_array_equal(rows, np.arange(50))
-    assert_allclose(off_m, 0.006)
-    surface = _Surface(x, x, x[:, 0], rows, x.mean(axis=0), 1.0)
-    offset = surface.offset(T)
-    assert_allclose(surface.pose(offset), T, atol=1e-12)
-    assert_allclose(surface.centre + offset[:3], T[:3, :3] @ surface.centre + T[:3, 3])
-    # A rotation about the centre displaces places in proportion to their distance from its axis.
-    covariance = np.diag([0.01, 0.04, 0.09, 0, 0, 0.0004])
-    alignment = Alignment(covariance=covariance, centre=np.array([1.0, 0, 0]))
-    normals = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-    expected = np.sqrt([0.01 + 0.0004 * 25, 0.04 + 0.0004 * 4, 0.09])
-    assert_allclose(alignment.sigma_m(np.tile([3.0, 5, 7], (3, 1)), normals), expected)

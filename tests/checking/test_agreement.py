@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from radarsdf.checking.frames import hypotheses
-from radarsdf.poses.agreement import Agreement, Gain, choose_pairs, pairs_apart
+from radarsdf.poses.agreement import Agreement
 from scipy.spatial.transform import Rotation
 
 PAIRS = np.array([[0, 1], [1, 3]])
@@ -118,28 +118,3 @@ def test_scores_against_a_plain_calculation():
     assert agreement.spacing_m(0) == pytest.approx(np.median(own))
     few = Agreement([scans[0][:6], scans[0][:5]], 60, 60)
     assert few.spacing_m(0) > 0 == few.spacing_m(1)
-
-
-def test_a_gain_has_the_standard_error_of_its_mean():
-    given, other = np.array([1.0, 2.0, 4.0, 3.0]), np.array([[0.5, 1.0, 2.0, 2.5]])
-    found = Gain.over(given, other)
-    better = given - other[0]
-    assert found.mean[0] == pytest.approx(better.mean())
-    assert found.error[0] == pytest.approx(better.std(ddof=1) / 2)
-    assert found.significance[0] == pytest.approx(better.mean() / (better.std(ddof=1) / 2))
-    assert Gain.over(given[:1], other[:, :1]).significance[0] == 0  # a single pair is no evidence
-
-
-def test_pairs_are_neighbours_and_scans_after_a_displacement():
-    np.testing.assert_array_equal(pairs_apart(np.array([2, 3, 5, 7, 8]), 2, 2), [[2, 5], [5, 8]])
-    scans = [np.full((6, 3), [10.0, 0.0, 0.0])] * 100
-    scans[50] = scans[50][:5]  # too few returns
-    positions = np.zeros((100, 3))
-    positions[:, 0] = 0.1 * np.arange(100)
-    pairs = choose_pairs(scans, positions, 48)
-    lags = np.unique(np.searchsorted(np.delete(np.arange(100), 50), pairs) @ [-1, 1])
-    np.testing.assert_array_equal(lags, [1, 2, 4, 5, 8, 10, 20, 40])  # 0.5 m are 5 scans
-    assert len(pairs) == 48
-    assert 50 not in pairs
-    assert len(choose_pairs(scans[:1], positions[:1], 48)) == 0
-    assert len(choose_pairs(scans[:2], positions[:2], 48)) > 0

@@ -7,8 +7,6 @@ from radarsdf.checking.doppler import check_doppler, velocity_of_poses
 from radarsdf.checking.recording import checked_input
 from radarsdf.returns.moving import folding_interval_mps, sensor_velocity
 
-from tests.conftest import recorded_scans
-
 STEP_S = 0.1
 VELOCITY_MPS = np.array([7.0, 0.4, -0.2])
 
@@ -55,16 +53,6 @@ def named(findings):
     return {finding.name: finding.severity for finding in findings}
 
 
-def test_the_velocity_is_found_among_moving_returns():
-    points, doppler, moves = one_scan()
-    found = sensor_velocity(points, doppler)
-    error = found.velocity_mps - VELOCITY_MPS
-    assert (np.abs(error) < 4 * np.sqrt(np.diag(found.covariance))).all()
-    assert np.linalg.norm(error[:2]) < 0.02
-    assert (~found.static[moves]).mean() > 0.99
-    assert found.static[~moves].mean() > 0.95
-
-
 def test_the_covariance_matches_the_errors():
     points = directions(300, seed=3)
     errors, sigmas = [], []
@@ -96,13 +84,6 @@ def test_inconsistent_speeds_have_no_velocity(doppler):
     found = sensor_velocity(directions(500), doppler)
     assert not found.found
     assert not found.static.any()
-
-
-def test_returns_in_one_direction_have_a_velocity_along_it():
-    points = np.outer(np.linspace(3, 30, 100), [1.0, 0, 0])
-    found = sensor_velocity(points, np.full(100, -7.0))
-    np.testing.assert_allclose(found.velocity_mps, [7, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), [0, 100, 100], atol=0.1)
 
 
 @pytest.mark.usefixtures("right_frames")
@@ -159,14 +140,3 @@ def test_doppler_that_contradicts_poses_or_intensities_is_named(drive):
     ):
         found = check_doppler(checked_input(points, poses, intensities, speeds, times))
         assert named(found).get(finding) == severity
-
-
-@pytest.mark.parametrize("name", ["r0009_0024", "r0133_0142"])
-def test_moving_returns_agree_with_the_flags_of_recorded_drives(name):
-    with np.load(recorded_scans(name)) as file:
-        points, doppler, static, frame = (file[k] for k in ("points", "doppler", "static", "frame"))
-    rows = [np.flatnonzero(frame == i) for i in range(frame.max() + 1)]
-    interval = folding_interval_mps([doppler])
-    found = [sensor_velocity(points[r], doppler[r], interval_mps=interval).static for r in rows]
-    agrees = np.concatenate([flags == static[r] for flags, r in zip(found, rows, strict=True)])
-    assert agrees.mean() > 0.95

@@ -6,12 +6,11 @@ import socket
 import subprocess
 import sys
 import time
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli.live import Replay, _Shown, replay
+from radarsdf.cli.live import replay
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
 from radarsdf.view.sinks import FREE_COLOR, foxglove_sink, rerun_sink
@@ -80,25 +79,6 @@ def test_scans_are_replayed_in_time_and_dropped_if_late(monkeypatch, rate, integ
 
 def test_scans_without_poses_need_times(recording, capsys):
     assert "times" in refusal(capsys, recording, "live", recording / "scans.npz", "--find")
-
-
-def test_sinks_get_all_scans_and_periodically_the_surface():
-    sink, mesh = Mock(), Mock(faces=[0])
-    scans = Scans(SCENE.points, SCENE.poses, None)
-    growing = Mock(**{"mesh.return_value": mesh, "config.returns.free_space": False})
-    shown = _Shown(growing, None, [sink])
-    cases = (True, 1), (False, 1), (True, 2)
-    for i, ((due, times), scan) in enumerate(zip(cases, scans, strict=False)):
-        shown._next_s = 0.0 if due else shown._next_s
-        done = Replay([0.0, 0.1, 0.2], rows=list(range(i + 1)), poses=list(SCENE.poses[: i + 1]))
-        shown(done, scan)
-        shown._thread.join()
-        assert sink.show_surface.call_count == times
-    assert [call.args[1] for call in sink.show_scan.call_args_list] == [0.0, 0.1, 0.2]
-    assert sink.show_scan.call_args.args[0].points is SCENE.points[2]
-    assert sink.show_surface.call_args.args[0] is mesh
-    np.testing.assert_array_equal(sink.show_surface.call_args.args[1], SCENE.poses[:3, :3, 3])
-    assert not sink.show_grid.called
 
 
 def test_mcap_readers_decode_what_is_shown(recording, capsys):

@@ -12,6 +12,7 @@ from ..poses.test_odometry import errors
 from .calls import call, refusal, values
 
 FRAMES = 24
+FEW = 12  # to locate
 
 
 @pytest.fixture(scope="module")
@@ -132,16 +133,16 @@ def test_outputs_are_checked_before_the_work(drive, drifted_file, tmp_path, caps
 
 def test_scans_are_located_in_a_map(drive, motion, tmp_path, capsys):
     scans = Scans(drive.points, drive.poses, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
-    write_scans(tmp_path / "drive.npz", scans)
+    write_scans(tmp_path / "drive.npz", scans.select(range(FEW)))
     config = radarsdf.FitConfig.quick()
     radarsdf.fit(drive.points, drive.poses, config=config, progress=False).save(tmp_path / "map.safetensors")
     out = tmp_path / "found.tum"
     found = values(capsys, "locate", tmp_path / "map.safetensors", tmp_path / "drive.npz", "-o", out)
-    assert found["found"] == FRAMES
-    assert np.abs(np.loadtxt(out)[:, 1:4] - drive.poses[:, :3, 3]).max() < 0.1
+    assert found["found"] == FEW
+    assert np.abs(np.loadtxt(out)[:, 1:4] - drive.poses[:FEW, :3, 3]).max() < 0.1
     page, there = tmp_path / "page.html", (tmp_path / "map.safetensors", tmp_path / "drive.npz")
     shown = values(capsys, "report", *there, "--locate", "-o", page)
-    assert shown["found"] == FRAMES
+    assert shown["found"] == FEW
     assert page.stat().st_size == shown["report_bytes"]
     assert refusal(capsys, tmp_path, "report", there[0], "--locate", "-o", page, status=2)
     yaw_deg = np.degrees(np.arctan2(drive.poses[0, 1, 0], drive.poses[0, 0, 0]))

@@ -11,8 +11,6 @@ from radarsdf.scans import Scans
 
 from .calls import FAST, call, refusal, values
 
-UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -73,19 +71,6 @@ def test_a_folder_is_converted_to_one_file(clouds, tmp_path_factory, capsys):
         for a, b in zip(ours, theirs, strict=True):
             np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(read.poses, scans.poses, atol=1e-12)
-
-
-def test_scans_are_converted_to_one_cloud(scans_file, tmp_path, capsys):
-    scans = read_scans(scans_file)
-    far = scans.poses.copy()
-    far[:, :3, 3] += UTM_M
-    write_scans(tmp_path / "far.npz", Scans(scans.points, far, scans.intensities))
-    world = np.concatenate([x @ T[:3, :3].T + T[:3, 3] for x, T in zip(scans.points, far, strict=True)])
-    for suffix in (".ply", ".npy", ".csv"):
-        said = values(capsys, "convert", tmp_path / "far.npz", "-o", tmp_path / f"cloud{suffix}")
-        assert (said["returns"], said["scans"]) == (9000, 6)
-        found = radarsdf.io.read_points(tmp_path / f"cloud{suffix}")
-        np.testing.assert_allclose(found, world, atol=1e-4, rtol=0)
 
 
 def test_a_mesh_is_converted_to_another_format(tmp_path, capsys):

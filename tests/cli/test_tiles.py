@@ -7,7 +7,6 @@ import pytest
 import radarsdf
 import trimesh
 from radarsdf.io.npz import read_scans
-from radarsdf.tiles import fit_tiles
 
 from .calls import QUICK, call, refusal, values
 
@@ -94,10 +93,3 @@ def test_invalid_folders_and_arguments_are_rejected(city, tmp_path, capsys):
         (["tiles", tmp_path / "nowhere.npz", "-o", tmp_path / "new"], "nowhere.npz"),
     ):
         assert named in refusal(capsys, tmp_path, *words)
-
-
-def test_no_cluster(city, capsys, tmp_path, monkeypatch):
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(fit_tiles, "_CONNECT_S", 0.5)
-    words = ["tiles", "fit", city, "--cluster", "tcp://127.0.0.1:9"]
-    assert "127.0.0.1:9" in refusal(capsys, tmp_path, *words)

@@ -12,7 +12,6 @@ from radarsdf._core import (
     CellSet,
     block_medians,
     cell_keys,
-    cell_rows,
     fit_cell_means,
     gather_rows,
     principal_axes,
@@ -286,17 +285,6 @@ def test_small_means_are_omitted():
     np.testing.assert_array_equal(large_keys, keys[kept])
     np.testing.assert_array_equal(large_means, means[kept])
     np.testing.assert_array_equal(still_explained, explained)
-
-
-def test_rows_number_cells_by_first_occurrence():
-    asked = views()
-    for kind in KINDS:
-        rows, count = cell_rows(kind[None], *asked)
-        expected = bins(kind, *asked)
-        assert count == expected.max() + 1
-        assert len(np.unique(np.stack([rows, expected], 1), axis=0)) == count
-        first = np.unique(rows, return_index=True)[1]
-        assert (np.diff(first) > 0).all()
 
 
 def test_unobserved_cells_have_no_mean():

@@ -97,15 +97,6 @@ def test_iterations_converge_to_the_least_squares_solution():
     assert sums[3] < 1.0001 * sum_of_squares(least)
 
 
-def test_planes_are_unchanged():
-    table, _, points, normals, information = scene()
-    points[:, 2], normals[:] = 0.03, [0, 0, 1]
-    distances = (table.leaf_vertices()[0][:, 2] * LEAF_M - 0.03).astype(np.float32)
-    np.testing.assert_allclose(
-        smoothed(table, distances, points, normals, information, 50), distances, atol=2e-6
-    )
-
-
 def test_distances_depend_only_on_data_within_reach():
     iterations = 3
     reach_m = iterations * VertexTable.SMOOTHING_REACH * LEAF_M
@@ -134,15 +125,6 @@ def test_any_number_of_threads_gives_the_same_bits():
     one = smoothed(table, rough, *planes, 5, num_threads=1)
     for num_threads in (2, 3):
         assert smoothed(table, rough, *planes, 5, num_threads=num_threads).tobytes() == one.tobytes()
-
-
-def test_without_planes_smoothing_only_reduces_bending():
-    table, rough, *planes = scene()
-    found = smoothed(table, rough, *(a[:0] for a in planes), 10)
-    matrix, _ = system(table, *(a[:0] for a in planes))
-    assert np.square(matrix @ found).sum() < 0.1 * np.square(matrix @ rough).sum()
-    empty = VertexTable(np.zeros(0, np.uint64), LEAF_M, 1, Encoding.OCTREE)
-    assert len(smoothed(empty, rough[:0], *planes, 3)) == 0
 
 
 def test_no_vertex_leaves_its_known_side():
@@ -223,15 +205,6 @@ def test_cells_along_rays_are_the_cells_crossed():
                 ends = (np.stack([low, low + LEAF_M + 2e-5]) - point) / direction.astype(np.float64)
             ends = np.where(direction == 0, np.array([[-np.inf], [np.inf]]), np.sort(ends, axis=0))
             assert max(ends[0].max(), -reach_m) <= min(ends[1].min(), reach_m)
-
-
-def test_a_longer_reach_crosses_all_cells_of_a_shorter_one():
-    points, directions, *_ = some_rays(5000, spread_m=300.0)
-    short, far = (keys_along(points, directions, reach_m) for reach_m in (0.4, 0.6))
-    assert np.isin(short, far).all()
-    assert len(far) > len(short)
-    for num_threads in (1, 3):
-        np.testing.assert_array_equal(far, keys_along(points, directions, 0.6, num_threads))
 
 
 @pytest.mark.parametrize("num_levels", [1, 3])

@@ -220,15 +220,6 @@ def test_same_bits_for_any_number_of_threads():
             np.testing.assert_array_equal(first, second)
 
 
-def test_free_space_above_a_surface_has_no_features():
-    # Every column is occupied on the planes; only cells in space distinguish the air from the ground.
-    table = make_table(surface_points(5000))
-    features = torch.ones(table.num_rows, 8, dtype=torch.float64)
-    above = torch.tensor(surface_points(100) + np.array([0, 0, 5.0]))
-    assert (kernels.interpolate(features, above, table) == 0).all()
-    assert (kernels.interpolate(features, torch.tensor(surface_points(100)), table) != 0).any()
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e9])
 def test_points_outside_every_lattice_have_no_cell(value):
     table = make_table(surface_points(100))

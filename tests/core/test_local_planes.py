@@ -86,16 +86,6 @@ def test_along_a_wall_the_position_is_unobservable():
     assert 0.4 < along < 2.5
 
 
-def test_scores_fall_with_the_distance():
-    planes, scan = planes_of(room(0), room(1)), room(2)
-    poses = np.stack([pose(x, 0, 0, 0, 0, yaw) for x, yaw in [(0, 0), (0.1, 0), (0.4, 0), (0, 0.2)]])
-    scores = planes.scores(scan, poses, VARIANCES).mean(axis=1)
-    assert scores[0] > 0.6
-    assert (np.diff(scores[:3]) < -0.03).all()
-    assert scores[3] < 0.5 * scores[0]
-    assert not planes.scores(scan + [500.0, 0, 0], poses, VARIANCES).any()
-
-
 SCANS, PLANES, EXTENT_M = 7, 12, 0.8
 SPREAD = np.outer(np.linspace(1, 2, SCANS), [0.05**2, 0.01**2, 0.02**2])  # of each scan
 

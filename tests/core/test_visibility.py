@@ -81,34 +81,6 @@ def test_results_do_not_depend_on_threads():
         np.testing.assert_array_equal(count_visibility(keys, LEAF_M, *rays, scans, num_threads), expected)
 
 
-def through(y_m, x_m=0.7, range_m=50.0):
-    """Identical rays of this range along x: points, directions, ranges, float32."""
-    points = np.column_stack([np.full_like(y_m, x_m), y_m, np.full_like(y_m, 0.3)])
-    directions = np.tile([1.0, 0, 0], (len(y_m), 1))
-    return tuple(a.astype(np.float32) for a in (points, directions, np.full_like(y_m, range_m)))
-
-
-def test_a_scan_counts_once_with_any_number_of_rays():
-    rays = through(np.linspace(0.1, 1.5, 600))
-    _, keys = sorted_cells([[0, 0, 0], [-1, 0, 0], [-5, 7, 7], [-100, 3, 1]])
-    for number_of_scans in (1, 2, 600):
-        scans = (np.arange(600) * number_of_scans // 600).astype(np.int32)
-        assert count_visibility(keys, LEAF_M, *rays, scans).tolist() == [number_of_scans] * 4
-
-
-def test_visibility_covers_the_ray_from_sensor_to_return():
-    """One ray along x from -49.3 m to 0.7 m: the cubes of 1.6 m from -31 to 0."""
-    ray, scan = through(np.array([0.5])), np.zeros(1, np.int32)
-    cells = np.array([[x, 0, 0] for x in range(-40 * CUBE_CELLS, 10 * CUBE_CELLS)])
-    cells, keys = sorted_cells(cells)
-    visibility = count_visibility(keys, LEAF_M, *ray, scan)
-    cubes = np.floor_divide(cells[:, 0], CUBE_CELLS)
-    np.testing.assert_array_equal(visibility, (cubes >= -31) & (cubes <= 0))
-    # Neighbours across the ray are not visible.
-    _, beside = sorted_cells([[-50, -1, 0], [-50, 8, 0], [-50, 0, -1], [-50, 0, 8]])
-    assert count_visibility(beside, LEAF_M, *ray, scan).tolist() == [0] * 4
-
-
 @pytest.mark.parametrize("num_cells", [1, 300, 40_000])
 def test_scans_of_cells_are_counted_once(num_cells):
     rng = np.random.default_rng(num_cells)

@@ -2,11 +2,9 @@
 
 #include <array>
 #include <cmath>
-#include <limits>
 #include <map>
 #include <random>
 #include <set>
-#include <stdexcept>
 #include <vector>
 
 #include "helpers.hpp"
@@ -82,17 +80,6 @@ TEST_CASE("FlatMap behaves like std::unordered_map") {
   }
 }
 
-TEST_CASE("points outside the lattice are rejected before anything is stored") {
-  for (const float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity(), -2e6F}) {
-    const float points[] = {0, 0, 0, 0, bad, 0};
-    radarsdf::CellSet cells(1.0);
-    CHECK_THROWS_AS(cells.insert(points, 2, 1), std::invalid_argument);
-    CHECK(cells.size() == 0);
-  }
-  CHECK_THROWS_AS(radarsdf::CellSet(0.0), std::invalid_argument);
-  CHECK_THROWS_AS(radarsdf::CellSet(std::nan("")), std::invalid_argument);
-}
-
 TEST_CASE("the table numbers the vertices of each level and group in Morton order") {
   constexpr int kLevels = 3;
   const std::set<std::uint64_t> set = random_keys(1500, 6, 8);
@@ -137,26 +124,5 @@ TEST_CASE("the table numbers the vertices of each level and group in Morton orde
       CHECK(table.num_rows() == first_row);
       CHECK(table.num_cells() == first_cell);
     }
-  }
-}
-
-TEST_CASE("a table rejects keys and settings that do not fit") {
-  using radarsdf::Encoding;
-  using radarsdf::VertexTable;
-  CHECK_THROWS_AS(VertexTable({2, 1}, 1, 1, Encoding::kOctree, 1), std::invalid_argument);
-  CHECK_THROWS_AS(VertexTable({1, 1}, 1, 1, Encoding::kOctree, 1), std::invalid_argument);
-  CHECK_THROWS_AS(VertexTable({1}, 0, 1, Encoding::kOctree, 1), std::invalid_argument);
-  CHECK_THROWS_AS(VertexTable({1}, 1, 0, Encoding::kOctree, 1), std::invalid_argument);
-  CHECK_THROWS_AS(VertexTable({1}, 1, radarsdf::kMaxLevels + 1, Encoding::kOctree, 1), std::invalid_argument);
-  CHECK_THROWS_AS(VertexTable({std::uint64_t{1} << 63}, 1, 1, Encoding::kOctree, 1), std::invalid_argument);
-  for (std::size_t axis = 0; axis < 3; ++axis) {  // the far vertex of a coarse cell must fit, too
-    std::uint32_t cell[3] = {};
-    const auto key_at = [&](std::uint32_t coordinate) {
-      cell[axis] = coordinate;
-      return radarsdf::morton_key(cell[0], cell[1], cell[2]);
-    };
-    constexpr std::uint32_t kEnd = (1u << radarsdf::kAxisBits) - 4;
-    CHECK(VertexTable({key_at(kEnd - 1)}, 1, 2, Encoding::kOctree, 1).num_rows() == 16);
-    CHECK_THROWS_AS(VertexTable({key_at(kEnd)}, 1, 2, Encoding::kOctree, 1), std::invalid_argument);
   }
 }

@@ -11,7 +11,6 @@
 
 #include "helpers.hpp"
 #include "util/bits.hpp"
-#include "util/instruction_set.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
 #include "util/parallel_sort.hpp"
@@ -193,12 +192,6 @@ TEST_CASE("an interrupt check can cancel a call, on the calling thread") {
   }
 }
 
-TEST_CASE("a number of threads is positive and has an upper bound") {
-  CHECK(radarsdf::resolve_num_threads(1) == 1);
-  CHECK(radarsdf::resolve_num_threads(0) >= 1);
-  CHECK(radarsdf::resolve_num_threads(1 << 30) <= 1024);
-}
-
 TEST_CASE("parallel_sort sorts with any number of threads") {
   std::mt19937_64 generator(2);
   for (const std::size_t size : {std::size_t{0}, std::size_t{1}, std::size_t{1000}, std::size_t{300001}}) {
@@ -212,23 +205,4 @@ TEST_CASE("parallel_sort sorts with any number of threads") {
       CHECK(sorted == expected);
     }
   }
-}
-
-TEST_CASE("the baseline is always available, and names are parsed") {
-  const auto available = radarsdf::available_instruction_sets();
-  REQUIRE(!available.empty());
-  CHECK(available[0] == radarsdf::InstructionSet::kBaseline);
-  for (const radarsdf::InstructionSet isa : available) {
-    CHECK(radarsdf::instruction_set_from_name(radarsdf::instruction_set_name(isa)) == isa);
-  }
-  CHECK_THROWS_AS(radarsdf::instruction_set_from_name("sse9"), std::invalid_argument);
-}
-
-TEST_CASE("large arrays are writable from end to end") {
-  const auto array = radarsdf::large_array<double>(3 << 20);  // 24 MB: huge pages are requested
-  std::fill_n(array.get(), 3 << 20, 1.5);
-  CHECK(array[(3 << 20) - 1] == 1.5);
-  radarsdf::LargeVector<int> numbers;
-  for (int i = 0; i < 5000000; ++i) numbers.push_back(i);
-  CHECK(numbers[4999999] == 4999999);
 }

@@ -117,15 +117,6 @@ def test_box_crops_mesh_and_ground_truth():
     assert everything["num_angles"] > m["num_angles"] > 0
 
 
-def test_f_score_ignores_outliers_and_f_score_all_counts_them():
-    mesh = trimesh.util.concatenate([plane(0.1), plane(1.5), plane(3.0), plane(4.5)])
-    m = surface_metrics(mesh, grid(step=0.05), samples=100_000)
-    assert m["accuracy_ratio"] == m["f_score"] == 1.0
-    assert m["outlier_ratio"] == pytest.approx(0.75, abs=0.01)
-    assert m["precision"] == pytest.approx(1 - m["outlier_ratio"])
-    assert m["f_score_all"] == pytest.approx(2 * 0.25 / 1.25, abs=0.01)
-
-
 @pytest.mark.parametrize("flip", [False, True], ids=["wound", "some triangles flipped"])
 def test_angles_of_a_cube(flip):
     cube = trimesh.creation.box((1.0, 1.0, 1.0))
@@ -231,18 +222,12 @@ def test_the_number_of_neighbours_is_chosen_by_an_inner_hold_out():
     assert (knn.predict(points, sensors + 1) == whole.predict(points, sensors + 1)).all()
 
 
-def test_knn_with_few_returns_and_bad_input():
+def test_knn_with_few_returns():
     one = KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0])
     assert one.predict([[9.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [0.0, 0.0, 0.0]).tolist() == [55.0, 55.0]
     assert one.predict(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
     with pytest.raises(ValueError, match="viewing direction"):
         one.predict([[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="at least one return"):
-        KNNIntensity(np.zeros((0, 3)), [0.0, 0.0, 0.0], [])
-    with pytest.raises(ValueError, match="intensities must be"):
-        KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0, 56.0])
-    with pytest.raises(ValueError, match="k <= candidates"):
-        KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0], candidates=4, k=5)
 
 
 WHOLE = moved(np.eye(4)[None], np.array([[30.0, -20, 10, 0.4, -0.3, 2.1]]))[0]
@@ -299,11 +284,6 @@ def test_errors_of_a_drift_are_root_mean_squares():
     brought = trajectory_metrics(WHOLE @ found, true)["absolute_m"]
     assert brought == pytest.approx(trajectory_metrics(found, true)["absolute_m"])
     assert brought < metrics["absolute_m"]
-
-
-def test_one_pose_has_no_steps():
-    metrics = trajectory_metrics(np.eye(4)[None], np.eye(4)[None])
-    assert (metrics["step_m"], metrics["relative_ratio"], metrics["length_m"]) == (0, None, 0)
 
 
 def test_wrong_arguments_are_refused():
@@ -382,19 +362,3 @@ def test_bins_of_few_points_are_ignored_by_the_maximum_gap():
     assert m["worst_gap"] == pytest.approx(0, abs=1e-9)
     assert m["bin_true_share"] == [1.0, *[None] * 8, pytest.approx(0.95)]
     assert m["bin_count"] == [1, *[0] * 8, 1000]
-
-
-@pytest.mark.parametrize(
-    ("function", "arguments", "name"),
-    [
-        (uncertainty_metrics, (np.zeros(30), np.ones(31)), "uncertainty_m"),
-        (uncertainty_metrics, (np.zeros(30), -np.ones(30)), "uncertainty_m"),
-        (uncertainty_metrics, (np.full(30, np.nan), np.ones(30)), "0 points are too few"),
-        (confidence_metrics, ([0.5], [True, False]), "is_true"),
-        (confidence_metrics, ([1.5], [True]), "confidence"),
-        (confidence_metrics, ([np.nan], [True]), "confidence"),
-    ],
-)
-def test_wrong_errors_are_refused(function, arguments, name):
-    with pytest.raises(ValueError, match=name):
-        function(*arguments)

@@ -105,29 +105,6 @@ def test_the_intensity_loss_trains_geometry_only_if_enabled(normals, geometry_fr
     assert any(p.grad is not None and bool(p.grad.any()) for p in geometry) != geometry_frozen
 
 
-def test_the_second_derivative_through_the_normals_is_right():
-    # Double precision: few finite differences cross a kink of a ReLU.
-    config = BARE.override(
-        networks={"normals": True, "intensity_hidden": (6,)}, encoding={"fourier_count": 2}
-    )
-    field, points = make_field(config)
-    field = field.double()
-    points = points[:8].double()
-    intensity(field, points, frozen=False).sum().backward()
-    analytic = field.cells.features.grad
-    rows = analytic.abs().sum(1).argsort(descending=True)[:5]
-    step = 1e-6
-    for row in rows.tolist():
-        values = []
-        for sign in (1, -1):
-            with torch.no_grad():
-                field.cells.features[row, 2] += sign * step
-            values.append(float(intensity(field, points).sum().detach()))
-            with torch.no_grad():
-                field.cells.features[row, 2] -= sign * step
-        assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(analytic[row, 2]), abs=1e-6)
-
-
 def test_the_sdf_loss_is_lowest_where_the_logit_is_the_label():
     sdf_m = torch.linspace(-0.3, 0.3, 13)
     logit = (sdf_m / 0.1).requires_grad_()

@@ -45,22 +45,6 @@ def test_contradicting_rays_are_averaged():
     np.testing.assert_allclose(fit(*rays_down([0.0, 0.12, 0.12])).sdf(x), expected, atol=0.02)
 
 
-def test_one_function_weighs_returns(monkeypatch):
-    higher = 300.0 - 0.06  # range of the mean ray between returns at 0 and 0.12 m
-    points, poses = rays_down([0.0, 0.12, 0.12])
-    x = inner_points()
-    before = fit(points, poses)
-
-    def only_near(counts, ranges_m, noise):
-        near = np.where(ranges_m < higher, 1000 * counts, 0.25 * counts)
-        return near, near / noise.variances_m2(ranges_m)
-
-    monkeypatch.setattr("radarsdf.returns.evidence.weights_of", only_near)
-    after = fit(points, poses)
-    assert np.median(after.sdf(x) - before.sdf(x)) < -0.02  # the surface moves up to the nearer returns
-    assert np.nanmedian(after.uncertainty(x)) < np.nanmedian(before.uncertainty(x)) / 2
-
-
 def test_smoothing_improves_surfaces_of_low_curvature(monkeypatch):
     rng = np.random.default_rng(2)
     points, poses = rays_down([0.0], spacing_m=0.15)

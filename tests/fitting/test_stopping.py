@@ -13,10 +13,6 @@ import radarsdf
 from radarsdf import Diverged, FitConfig, Interrupted, _core
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
-from radarsdf.io.npz import write_scans
-from radarsdf.scans import Scans
-
-from ..conftest import ground_and_wall
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 LONG = {"training": {"sdf_iterations": 1_000_000, "batch_size": 512}}
@@ -77,12 +73,14 @@ except KeyboardInterrupt as error:
     assert (radar_map.sdf(scene.poses[:, :3, 3], extrapolate=True) > 0).all()
     assert radar_map.confidence(scene.poses[:, :3, 3]).max() == 0
     assert len(radar_map.mesh(0.2).faces) > 100
+    # PyTorch's compiler, which takes a second to import.
+    assert not [name for name in sys.modules if name.partition(".")[0] == "sympy" or name == "torch._dynamo"]
     print("a map")
 """
 )
 
 
-def test_ctrl_c_while_training_returns_the_map():
+def test_ctrl_c_while_training_returns_the_map_without_pytorch_s_compiler():
     code = FIT.format(steps=400, intensities="scene.intensities", config=LONG | {"num_threads": 2})
     assert interrupted_python(code) == ("a map\n", 0)
 
@@ -121,34 +119,6 @@ def test_ctrl_c_ends_a_long_call_of_the_core():
         signal.signal(signal.SIGVTALRM, before)
     assert interrupted
     assert work_s < 0.6 * whole_s
-
-
-def test_the_command_saves_the_map_so_far_and_reports_it_in_one_line(tmp_path):
-    scene = ground_and_wall()
-    write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
-    code = (
-        ANNOUNCED.format(steps=5)
-        + """
-import sys
-from radarsdf.cli import main
-sys.exit(main())
-"""
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
-        + ["--quiet", "--set", "training={'sdf_iterations': 1000000}", "--checkpoint", str(tmp_path / "state")],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    assert process.stdout.readline() == "ready\n"
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=HUNG_S)
-    assert process.returncode == 130
-    assert said == f"error: interrupted while training; the map so far is in {tmp_path}/map.safetensors\n"
-    radar_map = radarsdf.load(tmp_path / "map.safetensors")
-    assert 0 < radar_map.report["iterations_done"]["sdf"] < 1_000_000
-    assert (tmp_path / "state").exists()
 
 
 def test_only_the_first_interrupt_is_deferred():

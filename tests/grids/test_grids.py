@@ -10,7 +10,6 @@ import pytest
 import radarsdf
 from radarsdf.cli import main
 from radarsdf.grids.grid import Grid, Wheels, save_arrays
-from radarsdf.grids.occupancy import _crossed, _touched
 
 from scenes.kinds import KINDS
 
@@ -270,29 +269,6 @@ def test_positions_are_located_in_their_voxel():
     for wrong in (upper, [upper[:2]], [[upper]]):
         with pytest.raises(ValueError, match="positions must have shape"):
             grid.at(wrong)
-
-
-def test_a_plane_occupies_adjacent_voxels_by_its_position_error():
-    """Probability that a plane through a voxel crosses another one, against random positions."""
-    normal = np.array([0.48, 0.6, 0.64])
-    planes = np.array([0.05, 0.05]), np.stack([normal, normal]), np.array([0.06, 0.1]), np.array([0.8, 0.0])
-    voxels, size, step = np.array([[2, 2, 2], [0, 0, 0]]), 0.2, 2
-    found = _touched(voxels, planes, (5, 5, 5), size, step)
-    drawn = 0.05 + 0.06 * np.random.default_rng(0).standard_normal(20_000)
-    for offset in np.ndindex(3, 3, 3):
-        voxel = voxels[0] + (np.array(offset) - 1) * step
-        distance_m = drawn + (np.array(offset) - 1) @ normal * step * size
-        share = (np.abs(distance_m) < 0.5 * size * normal.sum()).mean()  # whether the plane crosses the cube
-        assert found[tuple(voxel)] == pytest.approx(0.8 * share, abs=0.012)
-    assert np.count_nonzero(found) <= 27
-
-
-def test_a_surface_lies_between_the_voxels_on_both_sides():
-    distance_m = np.array([0.4, 0.1, -0.15, -0.2, np.nan, 0.05, 0.3, -0.6, -0.1, 0.12], np.float32)
-    expected = [False, True, True, False, False, False, True, False, True, True]
-    for axis in range(3):
-        line = distance_m.reshape([-1 if i == axis else 1 for i in range(3)])
-        assert _crossed(line, 0.15).ravel().tolist() == expected
 
 
 def in_map_server(path):

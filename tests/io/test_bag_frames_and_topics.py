@@ -256,18 +256,6 @@ def test_fields_without_a_role_may_have_any_type(tmp_path):
     assert_allclose(read(tmp_path / "a.bag", [np.eye(4)]).points, np.ones((1, 2, 3)))
 
 
-def test_arguments_of_bags_without_effect_are_refused(tmp_path):
-    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
-        for i in range(3):
-            bag.write("/odom", bag.odometry(100.0 + i, pose([i, 0, 0])), 100.0 + i)
-            bag.write("/radar", bag.cloud2(100.0 + i, dict.fromkeys("xyz", np.ones(1))), 100.0 + i)
-    for options in ({"world_frame": "map"}, {"columns": 4}, {"R_sensor_imu": np.eye(3)}):
-        with pytest.raises(ValueError, match=f"{next(iter(options))} would have no effect"):
-            read(tmp_path / "a.bag", **options)
-    with pytest.raises(ValueError, match="pose_topic would have no effect"):
-        read(tmp_path / "a.bag", [np.eye(4)] * 3, pose_topic="/odom")
-
-
 LEVER = {("base", "front"): pose([2.0, 0, 0.5]), ("base", "rear"): pose([-1.0, 0.3, 0], np.pi)}
 
 

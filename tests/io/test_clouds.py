@@ -260,18 +260,3 @@ def test_columns_missing_in_some_scans_are_omitted(tmp_path):
     mixed = Scans.of_source(lambda: iter([one_scan(0, 0.0), one_scan(1, 0.0, optional=False)]), Notes())
     write_cloud(tmp_path / "mixed.csv", mixed)
     assert "intensity" not in read_columns(tmp_path / "mixed.csv")
-
-
-def test_a_failing_source_leaves_the_old_file(tmp_path):
-    path = tmp_path / "cloud.ply"
-    path.write_bytes(b"old")
-
-    def source():
-        yield one_scan(0, 0.0)
-        raise FileNotFoundError(2, "gone", "scan.pcd")
-
-    with pytest.raises(FileNotFoundError) as error:
-        write_cloud(path, Scans.of_source(source, Notes()))
-    assert error.value.filename == "scan.pcd"
-    assert [file.name for file in tmp_path.iterdir()] == [path.name]
-    assert path.read_bytes() == b"old"

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from radarsdf.io import write_poses
-from radarsdf.io.poses import Trajectory, TransformChain, are_poses, poses_of, read_poses, trajectory_of
+from radarsdf.io.poses import poses_of, read_poses
 from radarsdf.scans import Notes
-from scipy.spatial.transform import Rotation
 
 from ..conftest import pose
 from ..poses.drift import trajectory
@@ -112,22 +111,6 @@ def test_units_of_named_columns_of_poses(tmp_path, head):
         read_poses(tmp_path / "a.csv", Notes())
 
 
-def test_units_of_matrices(tmp_path):
-    names = "r11 r12 r13 t1[mm] r21 r22 r23 t2[mm] r31 r32 r33 t3[mm]"
-    (tmp_path / "a.txt").write_text(f"# {names}\n1 0 0 1000 0 1 0 2000 0 0 1 3000\n")
-    assert_allclose(read_poses(tmp_path / "a.txt", Notes())[0, :3, 3], [1, 2, 3])
-    (tmp_path / "a.txt").write_text(
-        f"# t[min] {names}\n0.01 1 0 0 0 0 1 0 0 0 0 1 0\n0.02 1 0 0 0 0 1 0 0 0 0 1 0\n"
-    )
-    assert_allclose(read_poses(tmp_path / "a.txt", Notes()).times_s, [0.6, 1.2])
-    (tmp_path / "a.txt").write_text(
-        "# t[min] east[mm] north[mm] up[mm] a b c d\n1 2000 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n"
-    )
-    # Names without a role: the columns of TUM, in these units.
-    found = read_poses(tmp_path / "a.txt", Notes())
-    assert (found.times_s.tolist(), found.positions[0].tolist()) == ([60, 120], [2, 0, 0])
-
-
 def test_one_bad_pose_is_left_out_and_named(tmp_path):
     rows = [f"{t} {t} 0 0 0 0 0 1" for t in range(10)]
     rows[2], rows[4], rows[6] = "2 nan 0 0 0 0 0 1", "4 4 0 0 0 0 0 0", "6 6 0 0 0 oops 0 1"
@@ -146,44 +129,6 @@ def test_one_bad_pose_is_left_out_and_named(tmp_path):
     assert ["2 of 5 poses" in note and note.endswith("pose 1") for note in notes.lines] == [True, True]
     with pytest.raises(ValueError, match="pose 0 is not"):
         poses_of(np.full((2, 4, 4), np.nan), Notes())
-
-
-def test_one_time_of_many_is_as_all_of_them():
-    rng = np.random.default_rng(0)
-    times_s = 1.7e9 + np.cumsum(rng.uniform(0.05, 0.4, 50))
-    trajectory = Trajectory(times_s, rng.normal(size=(50, 3)), Rotation.random(50, random_state=0))
-    wanted = np.concatenate([rng.uniform(times_s[0], times_s[-1], 40), times_s[[0, 7, -1]]])
-    expected = trajectory.poses(wanted)
-    assert_allclose([trajectory.pose_at(t, 1.0) for t in wanted], expected, atol=1e-9)
-    assert trajectory.pose_at(times_s[0] - 0.01, 1.0) is None
-    assert trajectory.pose_at(times_s[-1] + 0.01, 1.0) is None
-    assert_allclose(trajectory.pose_at(times_s[-1] + 4e-4, 1.0), expected[-1], atol=1e-9)  # times are rounded
-    between_s = (times_s[3] + times_s[4]) / 2
-    assert trajectory.pose_at(between_s, 0.01) is None
-    assert trajectory.pose_at(between_s, times_s[4] - times_s[3]) is not None  # inclusive of the longest gap
-    assert trajectory.pose_at(times_s[-1] + 1.1e-3, 1.0) is None
-    assert trajectory.pose_at(times_s[0] - 0.9e-3, 1.0) is not None
-    assert trajectory.pose_at(np.nan, 1.0) is None
-    chain = TransformChain((POSES[1], trajectory, POSES[2]))
-    assert_allclose(chain.pose_at(wanted[0], 1.0), POSES[1] @ expected[0] @ POSES[2], atol=1e-9)
-    assert chain.pose_at(0.0, 1.0) is None
-    assert chain.span() == trajectory.span()
-
-
-def test_most_rows_of_a_table_must_be_poses():
-    """Quaternions may have errors of 0.01, for files of three digits; half of the rows may lack one, but none be wrong."""
-    rows = np.tile([0.0, 1, 2, 3, 0, 0, 0, 1], (4, 1))
-    rows[:, 0], rows[:, 7] = np.arange(4), [1.0099, 0.9901, 1.0101, 0.9899]
-    assert are_poses(rows[:, 1:]).tolist() == [True, True, False, False]
-    with pytest.raises(ValueError, match=r"x holds 2 poses at different times; .* 2 of 4 poses are left out"):
-        trajectory_of(rows, "x")
-    rows[3, 7] = 0  # a row without a rotation stands for a missing pose
-    notes = Notes()
-    assert trajectory_of(rows, "x", notes).times_s.tolist() == [0, 1]
-    assert notes.lines[0].endswith("the first: pose 2")
-    rows[1, 0] = 0  # the first of two poses at one time is used
-    with pytest.raises(ValueError, match="x holds 1 poses at different times"):
-        trajectory_of(rows, "x")
 
 
 WRITTEN, TIMES = trajectory(7), np.arange(7) * 0.25 + 1.6e9

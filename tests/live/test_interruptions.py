@@ -15,7 +15,7 @@ from .test_live_map import mesh_bits
 
 PACKAGE = str(pathlib.Path(radarsdf.__file__).parent / "live")
 SCENE = radarsdf.simulate.wall(frames=6)
-POINTS = [points[::8] for points in SCENE.points]
+POINTS = [points[::16] for points in SCENE.points]
 ORIGIN = SCENE.poses[0, :3, 3]
 
 

@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
-from radarsdf._core import cell_keys
-from radarsdf.live.regions import REGION_CELLS, RegionTable, region_places
-from radarsdf.returns.sums import lattice_of
 
 from bench.live.removal import state
 
@@ -152,34 +149,6 @@ def test_a_damaged_region_leaves_the_map_as_it_was(tmp_path):
             live.integrate(SCENE.points[7], FAR[0], SCENE.intensities[7])
         assert (state(live), len(live)) == (before, 7)
     live.integrate(SCENE.points[7], FAR[6], SCENE.intensities[7])  # which does not reach them
-
-
-RNG = np.random.default_rng(3)
-CELLS = RNG.integers(-150, 150, (4000, 3))
-
-
-def keys_of(cells):
-    return np.unique(cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0))
-
-
-@pytest.mark.parametrize("leaves_per_cell", [1, 2])
-def test_rows_are_stored_in_the_regions_of_their_cells(leaves_per_cell):
-    keys = keys_of(CELLS)
-    table = RegionTable(leaves_per_cell, number=np.zeros(1))
-    regions = np.unique(table.regions_of(keys))
-    table.put(regions, {"keys": keys, "number": np.arange(len(keys)) * 1.0})
-    whole = table.gather(regions)
-    np.testing.assert_array_equal(whole["keys"], keys)
-    np.testing.assert_array_equal(whole["number"], np.arange(len(keys)))
-    edge = REGION_CELLS // leaves_per_cell
-    for region, cube in zip(regions, region_places(regions), strict=True):
-        expected = (lattice_of(keys) // edge == cube).all(axis=1)
-        np.testing.assert_array_equal(table.gather(region[None])["number"], np.flatnonzero(expected))
-    some = regions[::3]
-    table.put(some, {"keys": keys[:0], "number": np.zeros(0)})
-    left = table.gather()["keys"]
-    np.testing.assert_array_equal(left, keys[~np.isin(table.regions_of(keys), some)])
-    assert table.num_bytes == 16 * len(left)
 
 
 def test_ghosts_of_an_incremental_map_equal_those_of_a_new_one():

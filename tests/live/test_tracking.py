@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
-from radarsdf.live.store import LoggedScan
-from radarsdf.live.tracking import Lost, Step, _signed
-from radarsdf.poses.doppler import SensorVelocities
+from radarsdf.live.tracking import Lost
 from radarsdf.poses.rigid import aligned
-from radarsdf.poses.tracking import begin_segment
-from radarsdf.returns.moving import SensorVelocity
 
 from scenes.kinds import KINDS
 
@@ -178,31 +174,3 @@ def test_the_next_scan_is_placed_relative_to_moved_scans(drive, tmp_path):
     live.remove("bad")
     done = follow(live, scans, motion, [9])
     assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[9])[:3, 3]) < 0.1
-
-
-def test_a_sensor_moves_if_its_velocity_is_five_deviations_from_zero():
-    logged = LoggedScan(np.eye(4), np.zeros((3, 3)), time_s=0.0)
-    covariance = np.diag([0.03, 0.04, 1.0]) ** 2 - 0.02**2 * np.eye(
-        3
-    )  # each velocity has an additional error of 0.02 m/s
-    for mean, moves in (
-        ([0.149, 0, 0], False),
-        ([0.151, 0, 0], True),
-        ([0.1, 0.149, 0], False),
-        ([0, 0, 4.9], False),
-    ):
-        velocity = SensorVelocity(np.array(mean), covariance, np.ones(3, bool))
-        assert Step(0, logged, velocity, begin_segment(np.eye(4))).moves == moves
-    assert Step(0, logged, None, begin_segment(np.eye(4))).moves
-
-
-def test_a_velocity_of_undetermined_sign_is_zero_with_its_speed_as_deviation():
-    mean, covariance = np.array([[3.0, 4, 0], [0, 1, 2]]), np.tile(0.01 * np.eye(3), (2, 1, 1))
-    velocities = SensorVelocities(mean, covariance, np.ones(3), [], np.ones(2, bool))
-    for sign in (1, -1):
-        found = _signed(velocities, sign)
-        np.testing.assert_array_equal(found.mean_mps, sign * mean)
-        np.testing.assert_array_equal(found.covariance, covariance)
-    found = _signed(velocities, 0)
-    assert not found.mean_mps.any()
-    np.testing.assert_allclose(found.covariance[0], [[9.01, 12, 0], [12, 16.01, 0], [0, 0, 0.01]])

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import radarsdf
 import torch
 from radarsdf.field.neural_field import NeuralField
 
@@ -48,23 +47,6 @@ def test_sensor_positions_broadcast(sharp_map):
     assert not np.allclose(each, one, atol=1e-3)
 
 
-@pytest.mark.parametrize("shape", [(3,), (5, 2), (5, 4), (2, 5, 3), ()])
-def test_wrong_shapes(query, shape):
-    _, function = query
-    with pytest.raises(ValueError, match=r"positions must have shape \(N, 3\)"):
-        function(np.zeros(shape))
-    with pytest.raises(ValueError, match=r"positions must have shape \(N, 3\)"):
-        function(torch.zeros(shape))
-
-
-def test_empty_queries(query):
-    name, function = query
-    for empty in (np.zeros((0, 3)), torch.zeros(0, 3)):
-        answer = function(empty)
-        assert tuple(answer.shape) == ((0, 3) if name == "gradient" else (0,))
-        assert type(answer) is type(empty)
-
-
 def test_a_nan_point_does_not_affect_others(query):
     name, function = query
     x = near_surface(9)
@@ -106,16 +88,3 @@ def test_gradient_is_the_derivative_of_the_distance(sharp_map):
     # A few steps cross a cell border or the kink of a ReLU.
     assert np.quantile(np.abs(difference - gradient).max(axis=1), 0.95) < 1e-3
     assert np.median(gradient[x[:, 0] < 19.5, 2]) > 0.5
-
-
-def test_repr_has_the_size_of_map_and_file(scene, sharp_map, tmp_path):
-    cells = sharp_map.report["leaf_cells"]
-    assert (
-        repr(sharp_map)
-        == f"RadarMap(surface and reflectance, {cells} cells, {sharp_map.file_bytes / 1e6:.1f} MB)"
-    )
-    sharp_map.save(tmp_path / "map.safetensors")
-    names = (tmp_path / "map.safetensors").stat().st_size - sharp_map.file_bytes
-    assert 0 < names < 5000  # with checksums of all arrays
-    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
-    assert repr(radarsdf.fit(scene.points, scene.poses, config=config)).startswith("RadarMap(surface, ")

@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.map.confidence import evidence
-from radarsdf.map.mesh import Surface
-from radarsdf.map.queries import to_local
 from radarsdf.map.threshold import Limits, Tally, Threshold
 
 WALL_X_M = 10.1
@@ -104,23 +101,6 @@ def test_lower_reachable_recall_keeps_more_surface():
     seen, unseen = (tally(*surface, existing=existing).threshold() for existing in (1, 3))
     assert unseen.min_confidence == 0.4 < seen.min_confidence
     assert unseen.coverage_of_observed == pytest.approx(0.9 / 3)
-
-
-def test_sums_of_parts_equal_those_of_the_whole(of_many):
-    surface = Surface.of(of_many._contents, 0.2)
-    middle = surface.vertices[surface.faces].mean(axis=1)[:, 1] > 0
-
-    scene = of_many._contents
-    found = evidence(scene, to_local(scene, surface.vertices + scene.origin))
-
-    def of(faces):
-        return Surface.from_triangles(scene, surface.vertices, faces, found, 0).tally
-
-    parts = [of(surface.faces[middle]), of(surface.faces[~middle])]
-    assert min(part.existing_m2 for part in parts) > 3
-    together = Tally.of_sums(parts[0].sums() + parts[1].sums())
-    np.testing.assert_allclose(together.sums(), surface.tally.sums(), rtol=1e-9, atol=1e-9)
-    assert together.threshold().min_confidence == surface.tally.threshold().min_confidence
 
 
 def test_a_tally_sums_areas_by_confidence():

@@ -177,17 +177,3 @@ def test_pickled_and_saved_maps_have_the_same_views(sharp_map, view, tmp_path):
     for other in (pickle.loads(pickle.dumps(sharp_map)), radarsdf.load(path)):
         assert other.sensor == sharp_map.sensor
         np.testing.assert_array_equal(other.render(POSE).points, view.points)
-
-
-@pytest.mark.parametrize(
-    ("pose", "options", "said"),
-    [
-        (np.eye(3), {}, "shape"),
-        (np.zeros((4, 4)), {}, "rigid"),
-        (POSE, {"returns": -1}, "returns"),
-        (POSE, {"returns": np.nan}, "returns"),
-    ],
-)
-def test_wrong_arguments(sharp_map, pose, options, said):
-    with pytest.raises(ValueError, match=said):
-        sharp_map.render(pose, **options)

@@ -1,14 +1,11 @@
 """Trajectories, and errors that accumulate with steps."""
 
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
-import radarsdf
-from radarsdf.io import Scans
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.simulate import RadarSensor, SimulatedScan, drifted, measured_motion
+from radarsdf.simulate import RadarSensor, SimulatedScan
 from scipy.spatial.transform import Rotation
 
 
@@ -61,14 +58,3 @@ def thinned(simulation, every):
     names = ("points", "intensities", "noiseless_intensities", "origin_kind")
     parts = {name: [values[::every] for values in getattr(simulation, name)] for name in names}
     return dataclasses.replace(simulation, **parts)
-
-
-@functools.cache
-def drifting_drive():
-    """48 scans with Doppler, times and drifting poses; and the true poses."""
-    street = radarsdf.simulate.oculii(seed=64, frames=48)
-    motion = measured_motion(street)
-    given = drifted(street.poses, 0.05, 0.004, 1)
-    return Scans(
-        street.points, given, doppler_mps=motion.doppler_mps, times_s=100 + motion.times_s
-    ), street.poses

@@ -8,7 +8,7 @@ import radarsdf
 from radarsdf.live.tracking import Lost
 from radarsdf.poses.agreement import sign_significance, turns_fast
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.consistency import Clock, Consistency, contradiction
+from radarsdf.poses.consistency import Clock, Consistency
 from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
 
@@ -34,6 +34,17 @@ def street():
 @pytest.fixture(scope="module")
 def motion(street):
     return measured_motion(street, seed=5)
+
+
+@pytest.fixture(scope="module")
+def tunnel():
+    return KINDS["tunnel"](seed=5, frames=20)
+
+
+@pytest.fixture(autouse=True)
+def right_frames(monkeypatch):
+    """Hypotheses on frames and axes, which take most of the time of a check, are tested in tests/checking."""
+    monkeypatch.setattr("radarsdf.checking.frames.check_frames", lambda *_: [])
 
 
 def odometry(street, speeds, times_s):
@@ -116,8 +127,7 @@ def test_a_changed_sign_of_a_sensor_that_turns_fast_is_found(factor):
 
 
 @pytest.mark.parametrize("fault", ["sign from half", "zero from half"])
-def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(fault):
-    tunnel = KINDS["tunnel"](seed=5, frames=20)
+def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(tunnel, fault):
     motion = measured_motion(tunnel, seed=5)
     speeds = [factor * values for factor, values in zip(FACTORS[fault], motion.doppler_mps, strict=True)]
     found, worst = odometry(tunnel, speeds, motion.times_s)
@@ -147,18 +157,6 @@ def test_doppler_of_other_scans_contradicts_given_poses(street, motion):
     before = velocities.mean_mps[np.maximum(np.arange(20) - 1, 0)]
     mixed = dataclasses.replace(velocities, mean_mps=0.7 * velocities.mean_mps + 0.3 * before)
     assert Consistency.of_poses(mixed, motion.times_s, street.poses).contradiction is None
-
-
-@pytest.mark.parametrize("ratio", [1.0, 0.0, -1.0, 1.2])
-def test_ratios_of_speeds_are_tested_by_window(ratio):
-    rng = np.random.default_rng(2)
-    shown_m = [2.0, 0, 0] + 0.02 * rng.standard_normal((30, 3))
-    doppler_m = shown_m * np.where(np.arange(30) < 15, 1, ratio)[:, None] + 0.01 * rng.standard_normal(
-        (30, 3)
-    )
-    found = contradiction(shown_m, doppler_m, np.full(30, 1e-4), np.arange(31))
-    assert (found is None) == (ratio == 1)
-    assert ratio == 1 or found.last > 15
 
 
 @pytest.mark.parametrize("fault", ["sign from half", "zero from half"])

@@ -1,7 +1,6 @@
 """Covariances, derivatives and rates of motions, against random draws, finite differences and manual values."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,29 +8,19 @@ from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.poses.agreement import (
     CLEAR,
-    ERRORS,
     Verdict,
     _crowding,
     _gains,
-    motion_significance,
-    of_neighbours,
     sign_significance,
 )
-from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, upright
 from radarsdf.poses.imu import Gyroscope
-from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
+from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, way
 from radarsdf.poses.odometry import PosedScans, pose_sigmas
 from radarsdf.poses.planes import (
-    PlaneMap,
     SensorReturns,
-    _removed_share,
     apart_m,
-    plane_cell_m,
-    reduction,
-    thin,
 )
-from radarsdf.poses.refine import _by_biases
 from radarsdf.poses.rigid import (
     aligned,
     between,
@@ -47,7 +36,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import Drive, Tracked, begin_segment, rates_of, track_drive
+from radarsdf.poses.tracking import Drive, Tracked, begin_segment, rates_of
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
 from scipy.stats import t as student
@@ -130,19 +119,6 @@ def test_an_uncertain_bias_has_the_derivatives_of_the_gradient():
         assert_allclose(by[k], slope, atol=1e-9)
         spans2 = motion.spans**2 / motion.shares[:, axis]
         assert own[k] == pytest.approx(spans2.sum() * sigma[axis] ** 2 / [0.1**2, 0.02**2][axis // 3])
-
-
-def test_spans_and_unsteady_steps():
-    times_s = np.array([0.0, 1, 2, 2, 5])
-    assert_allclose(spans_of(times_s, 5), [1, 1, 0.001, 3])  # two radars measure at once
-    assert_array_equal(spans_of(None, 3), [1, 1])
-    assert_array_equal(spans_of(np.zeros(3), 3), [1, 1])
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, 0, 3] = [0, 1, 3, 4, 6]  # steps of 1 and 2 m
-    assert unsteadiness(poses, None) == pytest.approx((np.sqrt(1 / 2 / 3), 0))
-    assert unsteadiness(poses, np.array([0.0, 1, 3, 4, 6])) == pytest.approx((0, 0))
-    assert unsteadiness(poses[:2], None) == (0, 0)
-    assert unsteadiness(poses[:3], None)[0] > 0
 
 
 def test_climbs_equal_a_kalman_update():
@@ -238,47 +214,6 @@ def test_rates_of_a_step_lead_to_the_next_one():
     assert not drive.turns_slowly
 
 
-def test_a_gyroscope_learns_from_turns_with_the_covariance_of_their_rates(monkeypatch):
-    rate, asked = MotionRate(np.array([0.1, -0.2, 0.3]), spread(12, 3)), []
-    passed = [begin_segment(np.eye(4))] * 3, [(rate, rate), (None, None)]
-    monkeypatch.setattr("radarsdf.poses.tracking.track_once", lambda *_: passed)
-    gyroscope = SimpleNamespace(learnt=asked.append)
-    track_drive(Drive([np.eye(3)] * 3, np.array([0, 0.5, 0.7]), None, gyroscope), FitConfig(), 1, False)
-    assert asked == [[rate, None]]
-
-
-def test_returns_reduce_and_errors_increase_covariances():
-    prior, left = np.diag([4.0, 4, 4]), np.diag([1.0, 3, 0.4])
-    assert _removed_share(prior, left) == pytest.approx(0.25)
-    assert _removed_share(prior, 5 * prior) == 0
-    total, part = np.diag([4.0, 9, 25]), np.diag([1.0, 9, 30])
-    turned = rotation(np.array([0.3, 1.0, -0.4]))
-    total, part = (turned @ m @ turned.T for m in (total, part))
-    M = reduction(total, part)
-    assert_allclose(M @ total @ M.T, turned @ np.diag([3.0, 0, 0]) @ turned.T, atol=1e-6)
-    assert begin_segment(np.eye(4), 3).segment == 3
-    assert np.isnan(begin_segment(np.eye(4)).agreeing)
-    assert [len(thin(np.zeros((n, 3)), 10)) for n in (0, 10, 11, 20, 21)] == [0, 10, 6, 10, 7]
-
-
-def test_returns_are_selected_by_range_and_cells_match_their_spacing():
-    line = np.outer([0.0, 1, 2, 3, 4], [0.6, 0, 0.8])
-    returns = SensorReturns.of([line, line[:3], line[4:]], 1.0, 3.0)
-    assert returns.scans.tolist() == [0, 0, 0, 1, 1]
-    assert_allclose(returns.ranges_m, [1, 2, 3, 1, 2])
-    assert_allclose(returns.directions, np.tile([0.6, 0, 0.8], (5, 1)), rtol=1e-6)
-    assert SensorReturns.of([line], 0.0, None).ranges_m.tolist() == pytest.approx([1, 2, 3, 4])
-    assert returns.every(2).ranges_m.tolist() == pytest.approx([1, 3, 2])
-    poses = np.stack([np.eye(4), transform(np.array([0, 0, np.pi / 2]), np.array([4.0, 0, 0])), np.eye(4)])
-    rays = returns.posed(poses)
-    assert_allclose(rays.points + rays.origin, [*line[1:4], [4, 0.6, 0.8], [4, 1.2, 1.6]], atol=1e-6)
-    assert plane_cell_m([4 * line, line[:1], 4 * line], 0.2) == pytest.approx(1.0)
-    assert plane_cell_m([line, line[:1]], 0.2) == pytest.approx(0.4)
-    assert plane_cell_m([line[:1]], 0.2) == pytest.approx(0.4)
-    assert median_range_m([line, line[:0]]) == pytest.approx(2)
-    assert median_range_m([line[:0]]) == 0
-
-
 def test_a_gain_is_significant_by_students_t():
     gains, groups = np.array([1.0, 3, 4, 8, 0]), np.array([0, 0, 2, 2, 3])  # means of 2, 6 and 0
     verdict = Verdict.by_groups(gains, groups)
@@ -308,21 +243,6 @@ def test_standard_deviations_of_poses_become_settings_of_returns():
         assert posed.config(stated) == stated
     assert PosedScans.refined(dataclasses.replace(refined, improved=False), poses).sigmas is None
     assert dataclasses.replace(posed, sigmas=(0.1, 7.0)).config(FitConfig()).returns.pose_sigma_rad == 1.0
-
-
-def test_common_errors_of_steps_equal_the_joint_inverse():
-    """Joint inverse of poses and biases, with a prior deviation of one."""
-    hessian, by = spread(8, 12) + 3 * np.eye(12), np.random.default_rng(9).normal(0, 0.3, (2, 12))
-    gradient, own = np.ones(12), np.array([3.0, 5])
-    motions = [SimpleNamespace(by_bias=lambda _, k=k: (by[[k]].reshape(1, 2, 6), own[[k]])) for k in (0, 1)]
-
-    def solved(more):
-        return -np.linalg.solve(hessian, gradient + np.ravel(more)).reshape(2, 6)
-
-    found = _by_biases(motions, np.zeros((2, 4, 4)), solved)
-    whole = np.linalg.inv(np.block([[hessian, by.T], [by, np.diag(own + 1)]]))[:12, :12]
-    added = whole - np.linalg.inv(hessian)
-    assert_allclose(found, [added[:6, :6], added[6:, 6:]], atol=1e-12)
 
 
 def test_motions_of_a_tracked_drive():
@@ -361,26 +281,6 @@ def test_motions_of_a_tracked_drive():
     assert_allclose(moving.steps[0, :3, 3], path)
 
 
-def test_information_independent_of_the_pose_is_subtracted():
-    """Of 100 along x at the pose and 40 on average near it, 60 remain."""
-    planes = PlaneMap(0.4)
-    asked = []
-
-    def agreement(_, pose, __):
-        asked.append(pose[0, 3])
-        along = {5: 100.0, 5.8: 70, 4.2: 30, 6.6: 50, 3.4: 10}[round(pose[0, 3], 6)]
-        return np.diag([along, 1e6, 1e6, 1e6, 1e6, 1e6]), np.zeros(6), np.zeros((6, 6)), 1.0
-
-    planes.fine = SimpleNamespace(agreement=agreement)
-    prior, pose = np.eye(6), transform(np.zeros(3), np.array([5.0, 0, 0]))
-    covariance = np.diag([1 / 101] + [1e-6] * 5)
-    found = planes._discount_chance(None, pose, prior, covariance)
-    assert_allclose(found, np.diag([1 / 61] + [1e-6] * 5), rtol=1e-9)
-    assert len(asked) == 5
-    sure = (0.05 * 0.8) ** 2 * 0.99  # in cells of 0.8 m, this needs no returns
-    assert planes._discount_chance(None, pose, sure * prior, covariance) is covariance
-
-
 def test_gains_equal_a_brute_force_search():
     rng = np.random.default_rng(11)
     before = drifted(trajectory(4), 0.1, 0.01, 3)
@@ -409,49 +309,3 @@ def test_gains_equal_a_brute_force_search():
     expected = np.log((counts[1] + floor) / (counts[0] + floor))
     assert_allclose(_crowding(held, used, before, trajectory(4)), expected, atol=1e-9)
     assert np.ptp(expected) > 0.5
-
-
-def test_the_displacement_between_scans_is_found_and_common_patterns_cancel():
-    rng = np.random.default_rng(3)
-    world, wall = (
-        rng.uniform(-20, 20, (300, 3)),
-        np.column_stack([rng.uniform(-20, 20, (2, 400)).T, np.zeros(400)]),
-    )
-    moved_m = np.array([1.0, 0.5, 0.2])
-    scales = np.array([0.5, 0.8, 1.0, 1.25])
-
-    def gains(first, second, moved_m):
-        steps = transform(np.zeros((8, 3)), np.outer([*-scales, *scales], moved_m))
-        logs = of_neighbours([first, second]).log_distances(1, 0, steps).mean(axis=1)
-        return np.subtract(*np.split(logs, 2))
-
-    assert gains(world, world - moved_m, moved_m).argmax() == 2
-    # Two views of a wall along the motion agree equally for either direction.
-    along = gains(wall[::2], wall[1::2], [1.0, 0, 0])
-    assert np.abs(along).max() < 0.05 * gains(world, world - moved_m, moved_m).max()
-
-
-def test_one_pair_of_scans_of_a_turning_sensor_shows_the_sign_of_the_doppler():
-    rng = np.random.default_rng(4)
-    world, times_s = rng.uniform(-20, 20, (300, 3)), np.array([0.0, 0.1])
-    velocity = np.array([[20.0, 1.0, 0.0]] * 2)
-    velocities = SensorVelocities(velocity, np.tile(np.eye(3), (2, 1, 1)), np.ones(3), [], np.ones(2, bool))
-    turn = rotation(np.array([0.0, 0.0, 0.2]))
-    scans = [world, (world - 0.1 * velocity[0]) @ turn]
-    for sign in (1, -1):
-        significance, yaws = sign_significance(scans, velocities.scaled(sign), times_s)
-        assert sign * significance > CLEAR
-        assert_allclose(yaws[int(sign < 0)], 0.2, atol=0.04)
-
-
-def test_scans_of_walls_along_the_motion_agree_best_without_it():
-    rng = np.random.default_rng(5)
-    motion, firsts = np.eye(4), np.arange(11)
-    motion[0, 3] = 1.0
-    motions = np.tile(motion, (11, 1, 1))
-    walls = [np.column_stack([rng.uniform(-10, 10, 300), np.repeat([-2.0, 2.0], 150), np.zeros(300)])] * 12
-    assert motion_significance(walls, firsts, motions) < -ERRORS  # the same clutter in each scan
-    world = rng.uniform(-20, 20, (500, 3))
-    scans = [world - i * motion[:3, 3] for i in range(12)]
-    assert motion_significance(scans, firsts, motions) > ERRORS
-    assert motion_significance([world, world], firsts[:1], motions[:1]) == 0  # too few

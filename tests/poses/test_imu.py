@@ -11,12 +11,10 @@ from radarsdf.poses.imu import (
     ImuAlignment,
     Inertial,
     UnusableGyroscopeError,
-    _windows,
     cumulate_turns,
     level_poses,
 )
 from radarsdf.poses.motion import MotionRate
-from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
 
@@ -95,15 +93,6 @@ def test_without_noise_it_is_exact(ride, monkeypatch, late_s):
     assert f"found to {np.degrees(report['sigma_rad']):.1f} degrees, {late}" in found.alignment.words
 
 
-def test_windows_end_after_four_seconds_and_at_gaps():
-    times_s = np.r_[0.1 * np.arange(60), 7.0, 7.1, 9.0 + 0.1 * np.arange(41)]
-    rows, window = _windows(times_s)
-    np.testing.assert_array_equal(rows, np.r_[:60, 62:103])  # two scans between gaps are too few
-    np.testing.assert_array_equal(window, np.repeat([0, 1, 2], [41, 19, 41]))
-    slow = _windows(np.arange(30.0))[1]
-    np.testing.assert_array_equal(slow, np.repeat([0, 1, 2], [11, 11, 8]))  # then of ten intervals
-
-
 @pytest.mark.parametrize(
     ("rate_rad_s", "speed_mps", "is_used"),
     [(5.9, 0, True), (6.1, 0, False), (2, 14.9, True), (2, 15.1, False)],
@@ -150,15 +139,6 @@ def test_straight_motion_leaves_the_rotation_undetermined():
     assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None
 
 
-@pytest.mark.parametrize(("scans", "enough"), [(19, False), (20, True)])
-def test_two_windows_of_scans_are_the_fewest(ride, imu, monkeypatch, scans, enough):
-    times_s, _, velocities = ride
-    asked, rows = [], slice(0, 5 * scans, 5)
-    monkeypatch.setattr("radarsdf.poses.imu._solve_linearly", lambda *given: asked.append(given))
-    assert ImuAlignment.of(imu, velocities.select(rows), times_s[rows]) is None
-    assert bool(asked) == enough
-
-
 def test_an_unobservable_rotation_is_requested_from_the_user(ride, imu):
     times_s, _, velocities = ride
     found = Inertial.of(dataclasses.replace(imu, specific_force=None), velocities, times_s, 0.0)
@@ -180,16 +160,6 @@ def test_a_bias_is_estimated_from_rotations(ride):
     np.testing.assert_allclose(found.bias.mean, bias, atol=3 * 0.05 / np.sqrt(299))
     with pytest.raises(UnusableGyroscopeError):
         Gyroscope.of(np.degrees(rates.angular_velocity), rates.times_s, times_s).learnt(shown)
-
-
-def test_products_of_many_small_turns():
-    turns = np.random.default_rng(4).normal(0, 0.3, (101, 3))
-    found, at = cumulate_turns(turns), np.eye(3)
-    assert len(found) == 102
-    for i, turn in enumerate(turns):
-        np.testing.assert_allclose(found[i], at, atol=1e-12)
-        at = at @ rotation(turn)
-    np.testing.assert_allclose(found[-1], at, atol=1e-12)
 
 
 @pytest.mark.parametrize("up", [(0.6, 0.0, 0.8), (0.6, 0.0, -0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])

@@ -12,6 +12,9 @@ from scenes.kinds import KINDS
 from scenes.revisits import SYMMETRIC, another_day, sessions, weaker
 
 from ..conftest import recorded_file
+from .drift import first as first_scans
+
+FEW = 12  # scans, of the 24 of another day: enough for two submaps
 
 
 def fitted(first):
@@ -28,8 +31,8 @@ def measured(day, frames=slice(None)):
     }
 
 
-def located(radar_map, day, **more):
-    scans = measured(day)
+def located(radar_map, day, frames=slice(None), **more):
+    scans = measured(day, frames)
     return radarsdf.locate(radar_map, scans.pop("points"), **scans, **more)
 
 
@@ -50,12 +53,26 @@ def radar_map(first):
 
 
 @pytest.fixture(scope="module")
+def index(radar_map):
+    return radarsdf.SurfaceIndex.of(radar_map)
+
+
+@pytest.fixture(scope="module")
 def day(first):
     return another_day(first, 1)
 
 
-def test_scans_of_another_day_are_found_in_the_whole_map(radar_map, day):
-    found = located(radar_map, day)
+@pytest.fixture(scope="module")
+def found(index, day):
+    return located(index, day)
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    return first_scans(KINDS["yard"], FEW, seed=3, frames=24)
+
+
+def test_scans_of_another_day_are_found_in_the_whole_map(found, day):
     off_m, off_deg = errors(found.poses, day.poses)
     assert np.median(off_m) < 0.05
     assert np.median(off_deg) < 0.3
@@ -66,10 +83,10 @@ def test_scans_of_another_day_are_found_in_the_whole_map(radar_map, day):
 
 
 @pytest.mark.parametrize("how", ["weaker", "reverse"])
-def test_another_radar_and_the_other_direction(first, radar_map, how):
+def test_another_radar_and_the_other_direction(first, index, how):
     changed = {"sensor": weaker(first.sensor)} if how == "weaker" else {"reverse": True}
-    other = another_day(first, 1, **changed)
-    off_m, off_deg = errors(located(radar_map, other).poses, other.poses)
+    other = first_scans(another_day, FEW, first, 1, **changed)
+    off_m, off_deg = errors(located(index, other).poses, other.poses)
     assert np.median(off_m) < 0.1
     assert np.median(off_deg) < 0.6
 
@@ -79,62 +96,61 @@ def test_a_saved_map_and_a_turned_world(first, day, tmp_path):
     T = moved(np.eye(4), np.array([5e5, 5.4e6, 300.0, 0, 0, 2.0]))
     turned = radarsdf.fit(first.points, T @ first.poses, config=FitConfig.quick(), progress=False)
     turned.save(tmp_path / "map.safetensors")
-    found = located(radarsdf.load(tmp_path / "map.safetensors"), day)
-    assert np.median(errors(found.poses, T @ day.poses)[0]) < 0.05
+    found = located(radarsdf.load(tmp_path / "map.safetensors"), day, slice(FEW))
+    assert np.median(errors(found.poses, T @ day.poses[:FEW])[0]) < 0.05
 
 
 @pytest.mark.parametrize("name", list(SYMMETRIC))
 def test_symmetric_places_are_refused(name):
-    place = SYMMETRIC[name](seed=2)
+    place = SYMMETRIC[name](seed=2, frames=30)
     with pytest.raises(radarsdf.Lost, match="two places") as refused:
-        located(fitted(place), another_day(place, 2))
+        located(fitted(place), first_scans(another_day, FEW, place, 2))
     assert refused.value.places.shape == (2, 4, 4)
 
 
-def test_scans_of_another_place_are_refused(radar_map):
-    other = KINDS["yard"](seed=3, frames=24)
+def test_scans_of_another_place_are_refused(index, elsewhere):
     with pytest.raises(radarsdf.Lost):
-        located(radar_map, other)
+        located(index, elsewhere)
+
+
+NEAR = np.array([0.2, -0.2, 0.1, 0.01, 0, 0.03])
 
 
 def test_a_guess_replaces_the_search():
     tunnel = KINDS["tunnel"](seed=2, frames=40)
     day = another_day(tunnel, 2)
-    radar_map = fitted(tunnel)
+    index = radarsdf.SurfaceIndex.of(fitted(tunnel))
     with pytest.raises(radarsdf.Lost):
-        located(radar_map, day)
-    guess = moved(day.poses[0], np.array([0.2, -0.2, 0.1, 0.01, 0, 0.03]))
-    found = located(radar_map, day, guess=guess)
+        located(index, day, slice(FEW))
+    found = located(index, day, guess=moved(day.poses[0], NEAR))
     off = np.abs(increments(day.poses, found.poses)[:, :3])
     sigmas = np.sqrt(np.einsum("fii->fi", found.covariance)[:, :3])
     assert np.median(off / sigmas) < 3
     assert np.median(errors(found.poses, day.poses)[0]) < 0.5
 
 
-def test_a_wrong_guess_is_refused(radar_map, day):
-    guess = moved(day.poses[0], np.array([0.2, -0.2, 0.1, 0.01, 0, 0.03]))
-    right = located(radar_map, day, guess=guess)
-    assert np.median(errors(right.poses, day.poses)[0]) < 0.05
+def test_a_wrong_guess_is_refused(index, day):
+    right = located(index, day, slice(FEW), guess=moved(day.poses[0], NEAR))
+    assert np.median(errors(right.poses, day.poses[:FEW])[0]) < 0.05
     for off in ([15.0, 0, 0, 0, 0, 0], [0, -8.0, 0, 0, 0, 0.5], [0, 0, 0, 0, 0, 3.0]):
         with pytest.raises(radarsdf.Lost, match="guess"):
-            located(radar_map, day, guess=moved(day.poses[0], np.array(off)))
+            located(index, day, slice(FEW), guess=moved(day.poses[0], np.array(off)))
 
 
-def test_a_guess_that_returns_do_not_confirm_is_not_sure(radar_map):
-    other = KINDS["yard"](seed=3, frames=24)
-    guess = moved(other.poses[0], np.array([30.0, 0, 0, 0, 0, 0]))
-    one = radarsdf.locate(radar_map, other.points[:1], times_s=[0.0], guess=guess)
-    for found in (located(radar_map, other, guess=guess), one):
+def test_a_guess_that_returns_do_not_confirm_is_not_sure(index, elsewhere):
+    guess = moved(elsewhere.poses[0], np.array([30.0, 0, 0, 0, 0, 0]))
+    one = radarsdf.locate(index, elsewhere.points[:1], times_s=[0.0], guess=guess)
+    for found in (located(index, elsewhere, guess=guess), one):
         assert any("guess" in note for note in found.report["notes"])
         assert (np.sqrt(np.einsum("fii->fi", found.covariance)[:, :2]) >= 0.5).all()
 
 
-def test_a_kidnapped_radar_is_found_again(first, radar_map):
-    early, late = (another_day(first, 1, stretch=part) for part in ((0.0, 0.3), (0.7, 1.0)))
+def test_a_kidnapped_radar_is_found_again(first, index):
+    early, late = (first_scans(another_day, FEW, first, 1, stretch=s) for s in ((0.0, 0.3), (0.7, 1.0)))
     parts = [measured(one) for one in (early, late)]
     points, speeds = ([*parts[0][name], *parts[1][name]] for name in ("points", "doppler_mps"))
     times_s = np.concatenate([parts[0]["times_s"], parts[0]["times_s"][-1] + 0.1 + parts[1]["times_s"]])
-    found = radarsdf.locate(radar_map, points, doppler_mps=speeds, times_s=times_s)
+    found = radarsdf.locate(index, points, doppler_mps=speeds, times_s=times_s)
     true = np.concatenate([early.poses, late.poses])
     known = found.segments >= 0
     assert errors(found.poses[known], true[known])[0].max() < 0.5
@@ -156,7 +172,7 @@ def test_sessions_are_joined_or_apart():
     assert found.report["joined"] == [0, 1, 2]
     for poses, day in zip(found.poses, of_place.together, strict=True):
         assert np.median(errors(poses, day.poses)[0]) < 0.15
-    found = radarsdf.join([scans(day, posed=False) for day in of_place.apart])
+    found = radarsdf.join([scans(day, posed=False).select(range(FEW)) for day in of_place.apart])
     assert found.verdicts[0, 1] != "joined"
     assert np.isnan(found.poses[1]).all()
 
@@ -205,14 +221,10 @@ def test_a_live_map_of_another_session_finds_the_radar(first, day, tmp_path):
     assert len(live) == len(first) + len(day)
 
 
-def test_the_index_of_a_map_is_saved(radar_map, day, tmp_path):
-    index = radarsdf.SurfaceIndex.of(radar_map)
+def test_the_index_of_a_map_is_saved(index, found, day, tmp_path):
     index.save(tmp_path / "index.npz")
-    again = radarsdf.SurfaceIndex.load(tmp_path / "index.npz")
-    scans = measured(day, slice(0, 12))
-    points = scans.pop("points")
-    found = [radarsdf.locate(each, points, **scans).poses for each in (index, again)]
-    assert np.abs(found[0] - found[1]).max() < 1e-3
+    again = located(radarsdf.SurfaceIndex.load(tmp_path / "index.npz"), day)
+    assert np.abs(found.poses - again.poses).max() < 1e-3
     content = bytearray((tmp_path / "index.npz").read_bytes())
     content[2000] ^= 255
     (tmp_path / "index.npz").write_bytes(content)

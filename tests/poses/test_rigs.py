@@ -14,10 +14,12 @@ from radarsdf.simulate import drifted, measured_imu
 
 from scenes.rigs import FRAME_S, drive_of_rig
 
+from .drift import first
+
 
 @pytest.fixture(scope="module")
 def drive():
-    return radarsdf.simulate.hugin(seed=5, frames=30)
+    return first(radarsdf.simulate.hugin, 20, seed=5, frames=30)
 
 
 @pytest.fixture(scope="module")

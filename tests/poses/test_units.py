@@ -64,10 +64,19 @@ def test_speeds_contradicting_returns_are_excluded(drive, motion):
     assert position_error_m(aligned(found.poses, drive.poses), drive.poses) < 0.1
 
 
+@pytest.fixture(scope="module")
+def yard():
+    return KINDS["yard"](seed=2, frames=24)
+
+
+@pytest.fixture(scope="module")
+def slope():
+    return first(KINDS["slope"], 24, seed=2, frames=40)
+
+
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
-def test_the_scale_of_the_doppler_is_estimated(factor):
+def test_the_scale_of_the_doppler_is_estimated(yard, factor):
     """Regression: 0.8 or 1.25 times the speed counted as right, with poses up to 100 standard deviations off."""
-    yard = KINDS["yard"](seed=2, frames=24)
     motion = measured_motion(yard, seed=2)
     speeds = [factor * speeds for speeds in motion.doppler_mps]
     checked = CheckedScans.of(yard.points, speeds, motion.times_s)
@@ -80,9 +89,8 @@ def test_the_scale_of_the_doppler_is_estimated(factor):
 
 
 @pytest.mark.parametrize(("late", "named"), [(3, "3 scans later"), (-5, "5 scans earlier")])
-def test_doppler_of_other_scans_is_excluded(late, named):
+def test_doppler_of_other_scans_is_excluded(slope, late, named):
     """Regression: velocities of three scans ago were believed, with poses 12 standard deviations off."""
-    slope = first(KINDS["slope"], 24, seed=2, frames=40)
     motion = measured_motion(slope, seed=2)
     checked = CheckedScans.of(slope.points, motion.doppler_mps, motion.times_s)
     velocities = checked.velocities

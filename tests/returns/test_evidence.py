@@ -184,10 +184,6 @@ def leaf_keys_of(rays):
     return cells.sorted_keys(1)
 
 
-def key_of(rays, cell):
-    return cell_keys(((np.array([cell], float) + 0.5) * LEAF_M - rays.origin), LEAF_M)[0]
-
-
 def added(rays, max_cells, leaf_keys=None):
     leaf_keys = leaf_keys_of(rays) if leaf_keys is None else leaf_keys
     cells = ReturnCells.of(rays, LEAF_M)
@@ -196,26 +192,6 @@ def added(rays, max_cells, leaf_keys=None):
     assert (np.diff(result.astype(np.int64)) > 0).all()
     assert np.isin(leaf_keys, result).all()
     return set(np.setdiff1d(result, leaf_keys).tolist())
-
-
-@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (1, 1, 0), (-1, 0, 1), (1, -1, -1)])
-@pytest.mark.parametrize("gap", [1, 2, 3])
-def test_only_the_cells_between_two_returns_are_opened(direction, gap):
-    start, step = np.array([3, -2, 0]), np.array(direction)
-    rays = rays_to([start, start + (gap + 1) * step])
-    between = {key_of(rays, start + i * step) for i in range(1, gap + 1)}
-    assert added(rays, gap) == between
-    assert added(rays, 8) == between
-    assert added(rays, gap - 1) == set()
-
-
-def test_badly_supported_and_dense_ends_are_not_bridged():
-    block = [(x, y, 0) for x in range(3) for y in range(3)]
-    lone = (4, 1, 0)
-    assert added(rays_to([*block, lone]), 1) == set()  # one return, against a median of five
-    assert len(added(rays_to([*block, lone, lone, lone]), 1)) == 1
-    for count, bridges in ((int(_MAX_SUPPORT) - 1, 1), (int(_MAX_SUPPORT), 0)):
-        assert len(added(rays_to([(0, 0, 0), (2, 0, 0)], count), 1)) == bridges
 
 
 @pytest.mark.parametrize("max_cells", [1, 2, 4, 9])

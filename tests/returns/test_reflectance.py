@@ -64,19 +64,6 @@ def test_with_a_network_the_prediction_is_the_mean_of_two(rays):
     np.testing.assert_allclose(found.network_share * answers + whole, expected, rtol=0, atol=1e-4)
 
 
-def test_a_network_is_asked_at_groups_along_unit_vectors(rays, monkeypatch):
-    monkeypatch.setattr(reflectance, "_MOST_RETURNS", 1000)
-    asked = []
-
-    def network(points, directions, _):
-        asked.append(directions)
-        return np.zeros(len(points), np.float32)
-
-    Reflectance.of(rays, unit(rays), Surfels.of(rays, LEAF_M, 1), LEAF_M, network)
-    assert 100 < len(asked[0]) < len(rays) / 2
-    np.testing.assert_allclose(np.linalg.norm(asked[0], axis=1), 1, atol=1e-6)
-
-
 @pytest.mark.parametrize("most", [1000, 10**9], ids=["groups", "returns"])
 def test_any_number_of_threads_has_the_same_bits(rays, monkeypatch, most):
     monkeypatch.setattr(reflectance, "_MOST_RETURNS", most)

@@ -1,12 +1,11 @@
 """A sensor is what its scans show: noise along the beam, in azimuth and in elevation, ranges and angles."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.returns.evidence import ReturnsOfCells, VisibilityCounts
+from radarsdf.returns.evidence import ReturnsOfCells
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
@@ -56,11 +55,6 @@ def test_a_sensor_of_rays_is_that_of_scans():
     for name in ("azimuth_rad", "elevation_rad", "range_m", "returns_per_scan"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name), abs=1e-5)
     np.testing.assert_allclose(found.thresholds, expected.thresholds, atol=1e-4)
-
-
-def test_json_keeps_a_sensor():
-    sensor = Sensor.of(*scans(), noise=NOISE)
-    assert Sensor.from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
 
 
 def test_numbers_at_their_limits_and_beyond_the_thresholds():
@@ -167,10 +161,3 @@ def test_errors_of_poses_are_common_to_the_returns_of_a_scan():
             returns.with_uncertain_poses(ranges_m, ReturnsConfig(**{name: 0.01})).information
             < returns.information
         ).all()
-
-
-def test_visibility_is_counted_in_blocks():
-    counts = VisibilityCounts(np.array([2, 5], np.uint64), np.array([7, 9], np.uint32))
-    leaves = np.array([0, 2 << 9, (2 << 9) + 511, 3 << 9, 5 << 9, 6 << 9], np.uint64)
-    assert counts.at(leaves).tolist() == [0, 7, 7, 0, 9, 0]
-    assert VisibilityCounts(counts.keys[:0], counts.scans[:0]).at(leaves).tolist() == [0] * 6

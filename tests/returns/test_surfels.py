@@ -107,17 +107,6 @@ def test_crossings_of_one_surfel():
     assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.0, 0.5)) == [0]
 
 
-def test_crossings_beyond_long_empty_ways():
-    away = np.random.default_rng(0).normal(size=(300, 3))
-    away[:, 0] = -np.abs(away[:, 0]) - 0.5
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    points = np.array([10.0, 0.2, 0.2]) - away  # 1 m behind the plane along rays through its centre
-    for range_m in (5.0, 60.0, 300.0):
-        arrays = points, -away, np.full(len(away), range_m)
-        found = one_surfel().first_crossings(*(a.astype(np.float32) for a in arrays), 0.0, 0.0, 0.1, 2.0)
-        assert (found == 0).all()
-
-
 def test_the_shift_is_the_best_linear_estimate():
     """Against plain NumPy, return by return."""
     points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01, scans=2)

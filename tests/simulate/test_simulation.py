@@ -202,35 +202,6 @@ def test_simulations_are_deterministic_by_seed(name):
     assert np.mean(np.abs(first - changed) > 0.01) > 0.3
 
 
-def test_a_sensor_and_a_material_without_settings_are_as_documented():
-    sensor, material = sim.RadarSensor(), sim.Material("plain", 0.0)
-    angle = np.array([0.0, 0.25])
-    lobe = 0.5 * np.cos(angle) ** 2 + 0.5 * np.exp(-0.5 * (angle / 0.25) ** 2)
-    np.testing.assert_allclose(
-        material.echo_db(np.zeros((2, 3)), np.cos(angle)), 10 * np.log10(lobe), atol=1e-4
-    )
-    scan = sensor.scan(wall_ahead(10.0, material), np.eye(4))
-    points = scan.points.astype(np.float64)
-    range_m, azimuth = np.linalg.norm(points, axis=1), np.arctan2(points[:, 1], points[:, 0])
-    elevation = np.arcsin(points[:, 2] / range_m)
-    assert (scan.origin_kind == sim.Origin.SURFACE).all()
-    assert 0.9 * 3000 < len(points) <= 3000
-    assert np.abs(azimuth).max() == pytest.approx(0.96, abs=0.02)
-    assert np.abs(elevation).max() == pytest.approx(0.26, abs=0.03)
-    noise_m = np.hypot(0.04, np.hypot(0.004 * points[:, 1], 0.006 * points[:, 2]))
-    assert np.std((points[:, 0] - 10.0) / noise_m) == pytest.approx(1.0, rel=0.1)
-    ahead = np.abs(azimuth) < 0.05
-    assert np.median(scan.noiseless_intensities[ahead]) == pytest.approx(130.0 - 40.0, abs=0.5)
-    assert 64.0 <= scan.intensities.min() < 70.0
-    np.testing.assert_allclose(scan.intensities * 10, np.round(scan.intensities * 10), atol=1e-3)
-    assert scan.intensities.max() < 118.0
-    for distance_m in (0.45, 59.0):
-        points = sensor.scan(wall_ahead(distance_m, material), np.eye(4)).points
-        range_m = np.linalg.norm(points.astype(np.float64), axis=1)
-        assert 0 < len(points) < 3000
-        assert ((range_m > 0.5 - 1e-5) & (range_m < 60 + 1e-5)).all()
-
-
 def test_clutter_does_not_change_the_other_returns():
     scene, pose = wall_ahead(10.0), np.eye(4)
     clean = QUIET.scan(scene, pose, seed=1)
@@ -309,11 +280,3 @@ def test_reflector_lobe_in_the_wall_scene():
 def test_impossible_sensors_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         sim.RadarSensor(**wrong)
-
-
-def test_an_empty_world_returns_nothing():
-    simulation = sim.simulate(sim.Scene([]), QUIET, np.eye(4)[None], name="void")
-    assert simulation.world_points().shape == (0, 3)
-    assert simulation.ground_truth.shape == (0, 3)
-    assert np.isnan(simulation.intensity_noise_floor())
-    assert len(simulation) == 1

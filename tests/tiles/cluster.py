@@ -17,7 +17,7 @@ import numpy as np
 from radarsdf.map import storage
 from radarsdf.tiles.plan import Plan, map_path
 
-_WORKERS = 2
+_WORKERS = 1
 _START_S = 300.0
 
 

@@ -218,13 +218,3 @@ def test_unusable_scans_are_excluded(drive, tmp_path):
     ]
     with pytest.raises(ValueError, match="6 of 12 poses are not rigid transforms, the first is pose 6"):
         tiles_of(half, tmp_path / "half")
-
-
-def test_the_sensor_does_not_depend_on_the_order_of_scans(drive, tmp_path, monkeypatch):
-    monkeypatch.setattr("radarsdf.tiles.planning._SENSOR_SCANS", 5)
-    plans = [
-        plan_tiles(scans, tmp_path / f"city{i}", tile_size=TILE_M, halo=6.4, config=CONFIG)
-        for i, scans in enumerate((drive, drive.select(np.arange(len(drive))[::-1].copy())))
-    ]
-    assert plans[0].sensor.thresholds == plans[1].sensor.thresholds
-    assert plans[0].sensor.returns_per_scan == plans[1].sensor.returns_per_scan

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radarsdf.view import scene as module
-from radarsdf.view.quantities import key, legend, quantities_of
+from radarsdf.view.quantities import quantities_of
 from radarsdf.view.scene import Canvas, Painter, State
 from radarsdf.view.surface import ShownSurface
 
@@ -93,30 +93,6 @@ def test_the_cloud_hides_what_the_mesh_hides(page, sharp_map):
     seen = canvas._cloud.points + sharp_map.origin
     assert 0 < len(seen) == len(canvas._cloud.colors) < len(canvas._spread)
     assert (sharp_map.uncertainty(seen) <= limit * 1.01).all()
-
-
-def test_quantities_are_those_of_the_map_on_their_scales(page, sharp_map):
-    surface, rows = page[1]._surface, np.arange(0, 200, 7)
-    x, sensor = surface.vertices, (3.0, 1.0, 1.5)
-    found = quantities_of(sharp_map, surface, ALL.sensor)
-    values = {
-        "intensity": sharp_map.intensity(x, np.array(ALL.sensor)),
-        "uncertainty": sharp_map.uncertainty(x), "confidence": sharp_map.confidence(x), "height": x[:, 2],
-    }  # fmt: skip
-    assert list(found) == list(values)
-    moved = sharp_map.intensity(x, np.array(sensor))
-    for name, of_all in values.items():
-        quantity, shown = found[name], moved if name == "intensity" else of_all
-        np.testing.assert_allclose(quantity.values(rows, sensor), shown[rows], rtol=1e-4)
-        low, high = (0, 1) if name == "confidence" else np.nanpercentile(of_all, [2, 98])
-        assert (quantity.scale.low, quantity.scale.high) == pytest.approx((low, high), rel=1e-4)
-        assert f"<span>{low:.3g}</span><span>{high:.3g}</span>" in legend(quantity)
-        assert f"{name}, {low:.3g} to {high:.3g}" in key({name: quantity.scale})
-        assert quantity.of_sensor == (name == "intensity")
-    limit_m, least = float(surface.uncertainty_m[0]), float(surface.confidence[1])
-    assert surface.kept(limit_m, 0.0)[0]
-    assert surface.kept(np.inf, least)[1]
-    assert not surface.kept(np.nextafter(np.float32(limit_m), np.float32(0)), 0.0)[0]
 
 
 class SlowCanvas:

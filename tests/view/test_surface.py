@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from radarsdf.map.threshold import Threshold
 from radarsdf.view.serving import FOV_RAD, framing_pose
-from radarsdf.view.surface import ShownSurface, first_hit, glb, spread_evenly, thinned
+from radarsdf.view.surface import ShownSurface, first_hit, glb, thinned
 from scipy.spatial import cKDTree
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
@@ -28,18 +28,6 @@ def test_a_thinned_mesh_is_the_same_surface_with_the_same_attributes(sharp_map):
     assert cKDTree(samples).query(full.vertices)[0].max() < 2 * spacing_m
     assert (thin.vertex_normals * full.vertex_normals[row]).sum(axis=1).mean() > 0.8
     assert thinned(full, len(full.vertices), 0.1)[0] is full
-
-
-def test_volumetric_points_are_thinned_to_the_nearest_to_each_cube_mean():
-    points = np.random.default_rng(0).uniform(-3, 3, (4000, 3)) + [5e5, 0, 0]
-    rows, of_point, edge_m = spread_evenly(points, 100, 0.1)  # cubes of a surface would be far too small
-    assert 50 < len(rows) <= 100
-    cells = np.floor((points - points.min(axis=0)) / edge_m)
-    for number, row in enumerate(rows):
-        own = np.flatnonzero(of_point == number)
-        assert (cells[own] == cells[row]).all()
-        assert own[np.linalg.norm(points[own] - points[own].mean(axis=0), axis=1).argmin()] == row
-    assert len(np.unique(cells, axis=0)) == len(rows)
 
 
 def test_a_vertex_without_uncertainty_is_shown_unless_the_uncertainty_is_limited():
