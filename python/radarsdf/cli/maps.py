@@ -17,7 +17,7 @@ from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.io.bag_messages import is_bag
-from radarsdf.io.cloud_writing import write_cloud
+from radarsdf.io.clouds import write_cloud
 from radarsdf.io.files import check_outputs, check_regular_file, checked_suffix
 from radarsdf.io.meshes import MESH_SUFFIXES, read_ground_truth, read_mesh, write_mesh
 from radarsdf.io.npz import arrays_of, write_scans

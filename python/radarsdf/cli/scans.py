@@ -20,8 +20,7 @@ from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, plain, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
-from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
-from radarsdf.io.clouds import CLOUD_SUFFIXES
+from radarsdf.io.clouds import CLOUD_OUT_SUFFIXES, CLOUD_SUFFIXES, write_cloud
 from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 from radarsdf.io.meshes import MESH_SUFFIXES, holds_mesh, read_mesh, write_mesh
 from radarsdf.io.npz import write_scans

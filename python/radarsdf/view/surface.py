@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check, whole_number
-from radarsdf.io.glb import MATT, SRGB_TO_LINEAR, encode_glb
+from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
 
