@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radarsdf.view import scene as module
-from radarsdf.view.quantities import key, legend, quantities_of
 from radarsdf.view.scene import Canvas, Painter, State
-from radarsdf.view.surface import ShownSurface
+from radarsdf.view.surface import ShownSurface, as_html, quantities_of
 
 ALL = State((0.0, 0.0, 1.5), max_uncertainty_m=9.0, min_confidence=0.0, quantity="intensity")
 MOVING = replace(ALL, coarse=True, sensor=(3.0, 0.0, 1.5))
@@ -110,8 +109,8 @@ def test_quantities_are_those_of_the_map_on_their_scales(page, sharp_map):
         np.testing.assert_allclose(quantity.values(rows, sensor), shown[rows], rtol=1e-4)
         low, high = (0, 1) if name == "confidence" else np.nanpercentile(of_all, [2, 98])
         assert (quantity.scale.low, quantity.scale.high) == pytest.approx((low, high), rel=1e-4)
-        assert f"<span>{low:.3g}</span><span>{high:.3g}</span>" in legend(quantity)
-        assert f"{name}, {low:.3g} to {high:.3g}" in key({name: quantity.scale})
+        assert f"<span>{low:.3g}</span><span>{high:.3g}</span>" in as_html("legend", quantity)
+        assert f"{name}, {low:.3g} to {high:.3g}" in as_html("key", {name: quantity.scale})
         assert quantity.of_sensor == (name == "intensity")
     limit_m, least = float(surface.uncertainty_m[0]), float(surface.confidence[1])
     assert surface.kept(limit_m, 0.0)[0]

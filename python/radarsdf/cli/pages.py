@@ -18,7 +18,7 @@ from radarsdf.report.subject import Subject
 from radarsdf.report.writing import write_report
 from radarsdf.scans import Scans
 from radarsdf.view import serving
-from radarsdf.view.viewer import Viewer
+from radarsdf.view.pages import Viewer
 
 
 def view(given: Namespace, results: Results) -> None:

@@ -14,7 +14,7 @@ from radarsdf.report.surface import colored_picture
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
-from radarsdf.view.quantities import Scale
+from radarsdf.view.surface import Scale
 
 _SAMPLES = 1_000_000
 _MATCH_M = 0.4  # a vertex farther from the truth is an outlier rather than an inaccurate surface

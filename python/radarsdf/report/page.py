@@ -14,7 +14,7 @@ from radarsdf.checks import AnyPath
 from radarsdf.extras import require
 from radarsdf.io.files import write_whole
 from radarsdf.view.pages import centre_of
-from radarsdf.view.quantities import css_color
+from radarsdf.view.surface import css_color
 
 _NBSP = "\N{NO-BREAK SPACE}"
 

@@ -13,9 +13,8 @@ from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.report.subject import Subject
-from radarsdf.view.quantities import Scale
 from radarsdf.view.serving import framing_pose, free_port, set_initial_camera, start_server, stop_server
-from radarsdf.view.surface import glb
+from radarsdf.view.surface import Scale, glb
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
 _SCENE_ASPECT = 8 / 5  # aspect ratio of its frame on any screen, see the style in page.html
