@@ -20,8 +20,8 @@ from radarsdf.cli.scans import posed_scans, warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io import Scans, write_scans
 from radarsdf.io.files import check_outputs
-from radarsdf.report.page import require_extras
-from radarsdf.report.subject import Subject
+from radarsdf.report.sections import Subject
+from radarsdf.report.writing import require_extras
 from radarsdf.view import serving
 
 # Options of the demo that are passed on to its commands.

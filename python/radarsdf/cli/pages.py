@@ -13,9 +13,8 @@ from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.io.files import check_outputs
 from radarsdf.map.map import Map
-from radarsdf.report.page import require_extras
-from radarsdf.report.subject import Subject
-from radarsdf.report.writing import write_report
+from radarsdf.report.sections import Subject
+from radarsdf.report.writing import require_extras, write_report
 from radarsdf.scans import Scans
 from radarsdf.view import serving
 from radarsdf.view.pages import Viewer

@@ -13,8 +13,7 @@ from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.meshes import MESH_SUFFIXES
 from radarsdf.render.figures import save_grid_picture
-from radarsdf.report.page import require_extras
-from radarsdf.report.writing import write_changes_report
+from radarsdf.report.writing import require_extras, write_changes_report
 from radarsdf.view.pages import ChangesView
 from radarsdf.view.serving import url_of, wait
 

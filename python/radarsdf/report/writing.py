@@ -1,42 +1,32 @@
-"""The report on a map."""
+"""Write reports from the templates in `templates/`, which hold all prose. Jinja escapes every value."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+import base64
+import functools
+import math
+import time
+from collections.abc import Sequence
 from typing import Any
 
+import jinja2
 import numpy as np
 
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
 from radarsdf.checks import AnyPath
 from radarsdf.config.fit_config import FitConfig, flat_settings
 from radarsdf.config.toml import to_toml
-from radarsdf.report import plots
-from radarsdf.report.errors import error_values, intensity_values, uncertainty_values
-from radarsdf.report.page import fixed, require_extras, write_page
-from radarsdf.report.subject import MAX_VERTICES, Subject
-from radarsdf.report.surface import scene, surface_values, views
+from radarsdf.extras import require
+from radarsdf.io.files import write_whole
+from radarsdf.report import sections
+from radarsdf.report.sections import MAX_VERTICES, Subject, scene, views
 from radarsdf.view.pages import MEANING, centre_of
-from radarsdf.view.surface import thinned
+from radarsdf.view.surface import css_color, thinned
 
-_COUNTS = {
-    "tiles": "Tiles",
-    "returns": "Returns",
-    "ghosts": "Ghosts, left out of the surface",
-    "moving": "Moving returns, left out",
-    "intensity_outliers": "Intensity outliers, left out of the reflectance",
-    "leaf_cells": "Leaf cells",
-    "vertices": "Cell vertices",
-}
-_DURATIONS = {
-    "prepare_s": "Scan checks",
-    "ghosts_s": "Planes, sensor noise, ghosts",
-    "occupied_cells_s": "Cells and averaged surface",
-    "start_s": "Initial values, evidence of the cells",
-    "training_s": "Training",
-}
-_MAX_LISTED = 50
+
+def require_extras() -> None:
+    """Raise an ImportError with the install command if matplotlib or viser is missing."""
+    require("matplotlib", "viser", what="a report needs")
 
 
 def write_report(path: AnyPath, subject: Subject) -> int:
@@ -44,54 +34,20 @@ def write_report(path: AnyPath, subject: Subject) -> int:
     require_extras()
     report = subject.radar_map.report
     settings, defaults = (flat_settings(of.to_dict()) for of in (subject.radar_map.config, FitConfig()))
-    return write_page(
+    return _write_page(
         path,
         "report.html",
         subject=subject,
         report=report,
-        noise=report.get("noise"),
         fit_s=sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s"),
-        problems=[finding for finding in subject.findings or () if finding.severity != "note"],
-        poses=pose_values(report.get("poses")),
-        surface=surface_values(subject),
-        errors=error_values(subject),
-        uncertainty=uncertainty_values(subject),
-        intensity=intensity_values(subject),
-        training=_training(report),
-        durations=[(name, fixed(report[key], 2, "s")) for key, name in _DURATIONS.items() if key in report],
-        skipped=[
-            (name, "–" if seconds is None else f"about {seconds:.1f} s")
-            for name, seconds in itertools.zip_longest(report.get("skipped", []), report.get("skipped_s", []))
-        ],
+        poses=sections.pose_values(report.get("poses")),
+        surface=sections.surface_values(subject),
+        errors=sections.error_values(subject),
+        uncertainty=sections.uncertainty_values(subject),
+        intensity=sections.intensity_values(subject),
         changed=[(n, value, defaults[n]) for n, value in settings.items() if value != defaults[n]],
         toml=to_toml(subject.radar_map.config),
     )
-
-
-def pose_values(poses: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Values of the section on estimated poses. `poses`: their part of a map's report, None for poses used as passed."""
-    if poses is None:
-        return None
-    after = np.array(poses["after"])
-    before = None if poses["before"] is None else np.array(poses["before"])
-    sigma_m, sigma_deg = np.median(poses["sigma_m"]), np.degrees(np.median(poses["sigma_rad"]))
-    return {
-        "verdict": poses["verdict"],
-        "improved": poses["improved"],
-        "trajectory": plots.trajectory(before, after),
-        "sigma": (sigma_m, sigma_deg) if sigma_m else None,
-        "length_m": np.linalg.norm(np.diff(after, axis=0), axis=1).sum(),
-        "moved_m": None if before is None else np.linalg.norm(after - before, axis=1),
-    }
-
-
-def _training(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    rows = [(name, f"{report[key]:,}") for key, name in _COUNTS.items() if key in report]
-    if missing := report.get("missing_tiles"):
-        rows.append(("Missing tiles", ", ".join(missing)))
-    for stage, done in report.get("iterations_done", {}).items():
-        rows.append((f"Iterations, {stage}", f"{done:,} of {report['iterations'][stage]:,}"))
-    return rows
 
 
 def write_changes_report(
@@ -110,11 +66,41 @@ def write_changes_report(
         vertices = np.asarray(mesh.vertices, np.float64)
         local = vertices - vertices.mean(axis=0)
         surface = {"scene": scene(local, mesh.faces, colors), "views": views(mesh, colors)}
-    rows = []
-    for number, region in enumerate(regions[:_MAX_LISTED], 1):
-        size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
-        numbers = fixed(region.area_m2, 2), fixed(region.probability, 2)
-        rows.append((number, region.words, centre_of(region), size, *numbers))
-    values = {"report": changes.report, "regions": regions, "rows": rows, "max_listed": _MAX_LISTED}
-    kinds = [NAMES[kind] for kind in CHANGED]
-    return write_page(path, "changes.html", names=names, surface=surface, key=MEANING, kinds=kinds, **values)
+    values = {"report": changes.report, "regions": regions, "kinds": [NAMES[kind] for kind in CHANGED]}
+    return _write_page(path, "changes.html", names=names, surface=surface, key=MEANING, **values)
+
+
+def _write_page(path: AnyPath, template: str, **values: Any) -> int:
+    """Fill a template and write the page atomically. Returns the size of the file, bytes."""
+    made = time.strftime("%Y-%m-%d %H:%M")
+    data = _environment().get_template(template).render(made=made, **values).encode()
+    write_whole(path, data)
+    return len(data)
+
+
+def fixed(value: float, digits: int, unit: str = "") -> str:
+    """Format a number with a fixed number of decimals and its unit."""
+    return f"{value:,.{digits}f}" + (unit if unit in ("", "°") else "\N{NO-BREAK SPACE}" + unit)
+
+
+def percent(share: float) -> str:
+    return fixed(100 * share, 1, "%")
+
+
+def data_uri(image: bytes) -> str:
+    kind = "png" if image.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
+
+
+@functools.cache
+def _environment() -> jinja2.Environment:
+    options: dict[str, Any] = {
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+        "undefined": jinja2.StrictUndefined,
+    }
+    loader, extensions = jinja2.PackageLoader("radarsdf.report"), ["jinja2.ext.do"]
+    environment = jinja2.Environment(loader=loader, autoescape=True, extensions=extensions, **options)
+    filters = (centre_of, css_color, data_uri, fixed, math.degrees, percent)
+    environment.filters |= {own.__name__: own for own in filters}
+    return environment
