@@ -19,8 +19,7 @@ from radarsdf.cli.scans import posed_scans, warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io import Scans, write_scans
 from radarsdf.io.files import check_outputs
-from radarsdf.report.sections import Subject
-from radarsdf.report.writing import require_extras
+from radarsdf.report.writing import Subject, require_extras
 from radarsdf.view import serving
 
 # Options of the demo that are passed on to its commands.

@@ -18,24 +18,22 @@ from radarsdf.checks import check
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, until_stopped
-from radarsdf.cli.scans import located, unposed_scans
+from radarsdf.cli.scans import add_scans, located, unposed_scans
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.extras import require
 from radarsdf.grids.grid import save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.bag_messages import is_bag
-from radarsdf.io.clouds import write_cloud
 from radarsdf.io.files import check_outputs, check_regular_file, checked_suffix
 from radarsdf.io.meshes import MESH_SUFFIXES, read_ground_truth, read_mesh, write_mesh
-from radarsdf.io.npz import arrays_of, write_scans
+from radarsdf.io.npz import arrays_of
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
 from radarsdf.map.view import View, scans_of_views
 from radarsdf.render import picture
 from radarsdf.render.figures import save_grid_picture, save_view_picture
-from radarsdf.report.sections import Subject
-from radarsdf.report.writing import require_extras, write_changes_report, write_report
+from radarsdf.report.writing import Subject, require_extras, write_changes_report, write_report
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import predicted
@@ -44,6 +42,7 @@ from radarsdf.view.serving import has_display, url_of, wait
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
+_LISTED = 10  # regions, largest first
 
 
 def mesh(given: Namespace, results: Results) -> None:
@@ -128,14 +127,9 @@ def render(given: Namespace, results: Results) -> None:
         views = list(views)  # a picture shows the whole view; other formats need only the returns
     scans = scans_of_views(view for view in views if len(view))
     check(len(scans), f"{given.map} has no surface visible from there: nothing written")
-    if suffix == ".npz":
-        write_scans(out, scans)
-    elif suffix == ".ply":
-        write_cloud(out, scans)
-    else:
+    if suffix == ".png":
         save_view_picture(out, list(views))
-    count = sum(map(len, scans.points))
-    results.add_file(f"{count} returns of {len(scans)} scans", out, returns=count, scans=len(scans))
+    add_scans(results, out, scans)
 
 
 def _poses(words: list[str]) -> NDArray[np.float64]:
@@ -194,9 +188,6 @@ def _scans(given: Namespace, radar_map: Map, results: Results) -> Scans | None:
 def add_report(results: Results, path: Path, subject: Subject) -> None:
     size = write_report(path, subject)
     results.add(f"report of {size / 1e6:.1f} MB written to {path}", report=path, report_bytes=size)
-
-
-_LISTED = 10  # regions, largest first
 
 
 def compare(given: Namespace, results: Results) -> None:

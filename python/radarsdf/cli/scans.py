@@ -185,12 +185,17 @@ def convert(given: Namespace, results: Results) -> None:
     among = suffix in CLOUD_SUFFIXES and folder.is_dir() and folder in out.resolve().parents
     what = "lies in the folder of the scans, where it would be read as one of them: write it elsewhere"
     check_that(not among, f"{out} {what}")
-    scans = read_scans(given)
+    add_scans(results, out, read_scans(given))
+
+
+def add_scans(results: Results, out: Path, scans: Scans) -> None:
+    """Write scans or their returns by the suffix, unless that of a picture, and print how many."""
+    suffix = out.suffix.lower()
     if suffix == ".npz":
         write_scans(out, scans)
-        returns = sum(map(len, scans.points))
-    else:
-        returns = write_cloud(out, scans)
+    # Clouds are written in one pass, without all scans in memory.
+    is_cloud = suffix in CLOUD_OUT_SUFFIXES
+    returns = write_cloud(out, scans) if is_cloud else sum(map(len, scans.points))
     results.add_file(f"{returns} returns of {len(scans)} scans", out, returns=returns, scans=len(scans))
 
 
@@ -233,9 +238,8 @@ def join(given: Namespace, results: Results) -> None:
     folder, paths = given.out, given.sessions
     refuse_if(len(paths) < 2, "join takes at least two sessions")
     names = [f"{path.resolve().stem}.npz" for path in paths]
-    check_that(
-        len(set(names)) == len(names), f"the sessions must have different names, not {', '.join(names)}"
-    )
+    differ = len(set(names)) == len(names)
+    check_that(differ, f"the sessions must have different names, not {', '.join(names)}")
     folder.mkdir(exist_ok=True)
     check_outputs([folder / name for name in names], paths)
     sessions = []
