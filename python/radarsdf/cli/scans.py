@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from argparse import Namespace
 from collections.abc import Iterable
@@ -18,7 +17,7 @@ from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
 from radarsdf.cli.inputs import inputs_of, load_map, read_scans, scans_if, scans_or_unposed
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, plain, warn
+from radarsdf.cli.results import Results, as_json, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
 from radarsdf.io.clouds import CLOUD_OUT_SUFFIXES, CLOUD_SUFFIXES, write_cloud
@@ -159,7 +158,7 @@ def calibrate(given: Namespace, results: Results) -> None:
     values = {label: vars(one) for label, one in mountings.items()}
     results.add(mountings=values)
     if given.out is not None:
-        write_whole(given.out, f"{json.dumps(plain(values), indent=2)}\n".encode())
+        write_whole(given.out, f"{as_json(values)}\n".encode())
         results.add_file(f"{len(values)} mountings", given.out)
 
 
