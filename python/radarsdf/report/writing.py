@@ -9,10 +9,9 @@ import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
-import jinja2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
@@ -37,7 +36,7 @@ from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import MEANING, centre_of
 from radarsdf.view.serving import framing_pose, free_port, set_initial_camera, start_server, stop_server
-from radarsdf.view.surface import Scale, css_color, glb, thinned
+from radarsdf.view.surface import Scale, glb, templates_of, thinned
 
 MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
 _WIDTH, _HEIGHT = 1040, 650  # pixels
@@ -358,7 +357,9 @@ def scene(vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None 
 def _write_page(path: AnyPath, template: str, **values: Any) -> int:
     """Fill a template and write the page atomically. Returns the size of the file, bytes."""
     made = time.strftime("%Y-%m-%d %H:%M")
-    data = _environment().get_template(template).render(made=made, **values).encode()
+    environment, filters = templates_of("report"), (centre_of, data_uri, fixed, math.degrees, percent)
+    environment.filters |= {own.__name__: own for own in filters}
+    data = environment.get_template(template).render(made=made, **values).encode()
     write_whole(path, data)
     return len(data)
 
@@ -375,17 +376,3 @@ def percent(share: float) -> str:
 def data_uri(image: bytes) -> str:
     kind = "png" if image.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
-
-
-@cache
-def _environment() -> jinja2.Environment:
-    options: dict[str, Any] = {
-        "trim_blocks": True,
-        "lstrip_blocks": True,
-        "undefined": jinja2.StrictUndefined,
-    }
-    loader, extensions = jinja2.PackageLoader("radarsdf.report"), ["jinja2.ext.do"]
-    environment = jinja2.Environment(loader=loader, autoescape=True, extensions=extensions, **options)
-    filters = (centre_of, css_color, data_uri, fixed, math.degrees, percent)
-    environment.filters |= {own.__name__: own for own in filters}
-    return environment

@@ -216,16 +216,22 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
 
 
 def as_html(name: str, value: Any) -> str:
-    """Fill a macro of ``templates/panel.html``, such as "legend", which escapes the value."""
-    return str(getattr(_panels(), name)(value))
+    """Fill a macro of ``templates/panel.html``, such as "legend"."""
+    return str(getattr(templates_of("view").get_template("panel.html").module, name)(value))
 
 
 @functools.cache
-def _panels() -> Any:
-    options = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
-    environment = jinja2.Environment(loader=jinja2.PackageLoader("radarsdf.view"), **options)  # type: ignore[arg-type]
+def templates_of(subpackage: str) -> jinja2.Environment:
+    """Environment of the templates of a subpackage, which escapes all values."""
+    options: dict[str, Any] = {
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+        "undefined": jinja2.StrictUndefined,
+    }
+    loader, extensions = jinja2.PackageLoader(f"radarsdf.{subpackage}"), ["jinja2.ext.do"]
+    environment = jinja2.Environment(loader=loader, autoescape=True, extensions=extensions, **options)
     environment.filters["css_color"] = css_color
-    return environment.get_template("panel.html").module
+    return environment
 
 
 def css_color(color: Sequence[int]) -> str:
