@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from radarsdf import _core
-from radarsdf.evaluation.calibration import CALIBRATION_PROTOCOL
-from radarsdf.evaluation.intensity import INTENSITY_PROTOCOL
+from radarsdf.evaluation.predictions import CALIBRATION_PROTOCOL, INTENSITY_PROTOCOL
 from radarsdf.evaluation.surface import PROTOCOL
 
 from bench.measure import ROOT

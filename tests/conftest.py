@@ -80,9 +80,9 @@ def with_truth(scene):
 
 def draw_small(patch):
     """Faster reports, with small pictures and few samples of the ground truth."""
-    patch.setattr("radarsdf.report.surface._WIDTH", 160)
-    patch.setattr("radarsdf.report.surface._HEIGHT", 100)
-    patch.setattr("radarsdf.report.errors._SAMPLES", 20_000)
+    patch.setattr("radarsdf.report.writing._WIDTH", 160)
+    patch.setattr("radarsdf.report.writing._HEIGHT", 100)
+    patch.setattr("radarsdf.report.writing._SAMPLES", 20_000)
 
 
 @pytest.fixture(scope="session", autouse=True)

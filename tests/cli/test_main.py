@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.cli import main
-from radarsdf.cli.app import message_of
+from radarsdf.cli import main, message_of
 from radarsdf.cli.inputs import read_scans
 from radarsdf.cli.options import COMMANDS, OPTIONS, TILE_STEPS, Parser
 from radarsdf.cli.results import Results

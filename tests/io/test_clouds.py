@@ -8,8 +8,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
-from radarsdf.io.clouds import read_columns, read_points, unpack_lzf
+from radarsdf.io.clouds import CLOUD_OUT_SUFFIXES, read_columns, read_points, unpack_lzf, write_cloud
 from radarsdf.scans import Notes, Scan, Scans
 
 from .test_folders import write_pcd

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds import read_columns
-from radarsdf.io.name_times import times_in
 from radarsdf.io.poses import read_poses, trajectory_of
+from radarsdf.io.recordings import times_in
 from radarsdf.io.text import are_degrees, in_seconds, read_numbers
 from radarsdf.scans import Notes
 

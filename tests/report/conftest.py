@@ -14,7 +14,7 @@ HOSTILE = """<script>alert("{{ title }}")</script>'&amp;.safetensors"""
 def subject(scene, radar_map):
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    from radarsdf.report.subject import Subject  # noqa: PLC0415
+    from radarsdf.report.writing import Subject  # noqa: PLC0415
 
     scans = with_truth(scene)
     train, test = scans.select(np.arange(1, 6)), scans.select(np.arange(1))

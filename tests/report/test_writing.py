@@ -152,7 +152,7 @@ def test_a_map_alone_without_surface_intensities_or_training(subject, scene, tmp
 
 def test_a_large_mesh_is_drawn_thinned_and_evaluated_whole(subject, tmp_path, monkeypatch):
     faces, vertices = len(subject.mesh.faces), len(subject.mesh.vertices)
-    monkeypatch.setattr("radarsdf.report.subject.MAX_VERTICES", vertices // 3)
+    monkeypatch.setattr("radarsdf.report.writing.MAX_VERTICES", vertices // 3)
     large = dataclasses.replace(subject)
     assert len(large.shown[0].faces) < faces / 2
     page = write(tmp_path / "large.html", subject, scans=None, held_out=None)

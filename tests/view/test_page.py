@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from radarsdf.io import Scans
 from radarsdf.map.colors import intensity_colors
+from radarsdf.view.pages import Viewer
 from radarsdf.view.surface import shaded
-from radarsdf.view.viewer import Viewer
 from scipy.spatial import cKDTree
 
 pytest.importorskip("viser", reason="the extra view is not installed")

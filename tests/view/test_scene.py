@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radarsdf.view import scene as module
-from radarsdf.view.quantities import quantities_of
 from radarsdf.view.scene import Canvas, Painter, State
-from radarsdf.view.surface import ShownSurface
+from radarsdf.view.surface import ShownSurface, quantities_of
 
 ALL = State((0.0, 0.0, 1.5), max_uncertainty_m=9.0, min_confidence=0.0, quantity="intensity")
 MOVING = replace(ALL, coarse=True, sensor=(3.0, 0.0, 1.5))

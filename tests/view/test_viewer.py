@@ -12,9 +12,9 @@ import pytest
 import radarsdf
 from radarsdf.io import Scans
 from radarsdf.map.colors import intensity_colors
+from radarsdf.view.pages import Viewer
 from radarsdf.view.serving import start_server
 from radarsdf.view.surface import shaded
-from radarsdf.view.viewer import Viewer
 
 from ..conftest import ground_and_wall
 

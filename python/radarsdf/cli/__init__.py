@@ -1,15 +1,29 @@
 """The command line: ``radarsdf COMMAND``.
 
-`commands` lists them, `app` runs one and prints its error, `options` and `results` are shared; the other modules are the
-commands. They import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
+`options` lists the commands and their options, and `results` prints what they find; the other modules are the commands. They
+import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
 """
 
 from __future__ import annotations
 
+import io
+import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
-from radarsdf.cli.options import overview
+from radarsdf.cli.options import COMMANDS, TILE_STEPS, Parser, UsageError, overview, refuse_if, steps
+from radarsdf.cli.results import Results, warn
+
+# Errors with a message for the user. Every other error is a bug and keeps its traceback.
+_ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
+# Modules of the commands that are not in one of their own name.
+_MODULES = {
+    **dict.fromkeys(("demo", "fit"), "fits"),
+    **dict.fromkeys(("config", "info"), "settings"),
+    **dict.fromkeys(("check", "poses", "calibrate", "locate", "join", "convert"), "scans"),
+    **dict.fromkeys(("mesh", "eval", "render", "view", "report", "compare", "grid"), "maps"),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -18,11 +32,67 @@ def main(arguments: Sequence[str] | None = None) -> int:
     The status is 0 on success, 1 if the command failed or a check found an error, 2 if the command line is wrong, 130 if
     Ctrl-C stopped it.
     """
-    words = sys.argv[1:] if arguments is None else list(arguments)
+    # A character that the terminal cannot encode must not discard the results so far.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        return _run(sys.argv[1:] if arguments is None else list(arguments))
+    except UsageError as error:
+        warn(f"error: {error}")
+        return 2
+    except SystemExit:  # raised by --help
+        return 0
+    except KeyboardInterrupt as stop:  # 130, as in shells: 128 and the number of the signal
+        warn(f"error: {str(stop) or 'interrupted'}")
+        return 130
+    except BrokenPipeError:  # the reader is gone; nothing is left for Python to flush at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except _ERRORS as error:
+        warn(f"error: {message_of(error)}")
+        return 1
+
+
+def _run(words: list[str]) -> int:
+    commands = {name: found for of_heading in COMMANDS.values() for name, found in of_heading.items()}
     if words in ([], ["--help"], ["-h"]):
         print(overview())
         return 0
+    command, *words = words
+    if command == "--version":
+        import radarsdf
 
-    from radarsdf.cli.app import run
+        print("radarsdf", radarsdf.__version__)
+        return 0
+    refuse_if(command not in commands, f"unknown command {command!r:.50}; radarsdf --help lists all")
+    arguments, text = commands[command]
+    if command == "tiles":
+        if not words or words[0] in ("-h", "--help"):
+            print(steps())
+            return 0
+        step = words.pop(0) if words[0] in TILE_STEPS else "run"
+        command, (arguments, text) = f"tiles {step}", TILE_STEPS[step]
+    usage = " ".join(filter(None, ("radarsdf", command, arguments, "[OPTIONS]...")))
+    given = Parser(command, usage, text).parse_args(words)
 
-    return run(words)
+    results = Results(**{key: vars(given).get(key, False) for key in ("quiet", "json")})
+    # Each module imports only what it needs, which may take long.
+    name, _, step = command.partition(" ")
+    module = import_module(f"radarsdf.cli.{_MODULES.get(name, name)}")
+    status = getattr(module, step or ("evaluate" if name == "eval" else name))(given, results)
+    results.end()
+    return int(status or 0)
+
+
+def message_of(error: Exception) -> str:
+    """Format an error as one line: of pydantic's, the first wrong setting; of the system's, the file and the reason."""
+    if type(error).__name__ == "ValidationError":  # imported only with the settings
+        from radarsdf.settings import first_wrong
+
+        return first_wrong(error)  # type: ignore[arg-type]
+    if isinstance(error, OSError) and error.strerror is not None:
+        return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    # NumPy's message describes an internal array; our own messages are kept.
+    if isinstance(error, MemoryError) and (not str(error) or str(error).startswith("Unable to allocate")):
+        return "there is not enough memory"
+    return " ".join(str(error).split()) or type(error).__name__

@@ -11,17 +11,15 @@ from importlib.util import find_spec
 import radarsdf
 from radarsdf import Interrupted, RadarMap
 from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split, without_intensities
-from radarsdf.cli.maps import evaluate, mesh
+from radarsdf.cli.maps import add_report, evaluate, mesh
+from radarsdf.cli.maps import view as show_map
 from radarsdf.cli.options import LIMITS, Parser, refuse_if
-from radarsdf.cli.pages import add_report
-from radarsdf.cli.pages import view as show_map
 from radarsdf.cli.results import Results
 from radarsdf.cli.scans import posed_scans, warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io import Scans, write_scans
 from radarsdf.io.files import check_outputs
-from radarsdf.report.page import require_extras
-from radarsdf.report.subject import Subject
+from radarsdf.report.writing import Subject, require_extras
 from radarsdf.view import serving
 
 # Options of the demo that are passed on to its commands.

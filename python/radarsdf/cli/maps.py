@@ -1,7 +1,8 @@
-"""``radarsdf mesh``, ``eval`` and ``render``: outputs of a map, and its errors."""
+"""Commands that use a map: ``mesh``, ``eval``, ``render``, ``view``, ``report``, ``compare`` and ``grid``."""
 
 from __future__ import annotations
 
+import webbrowser
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,29 +11,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import radarsdf
 from radarsdf import evaluation
+from radarsdf.changes.compare import compare as compare_maps
 from radarsdf.checks import check
-from radarsdf.cli.inputs import is_map, load_map, mesh_limits, scans_if, split
+from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results
+from radarsdf.cli.results import Results, until_stopped
+from radarsdf.cli.scans import add_scans, located, unposed_scans
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
+from radarsdf.extras import require
+from radarsdf.grids.grid import DISTANCE_SUFFIXES, save_arrays
+from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.bag_messages import is_bag
-from radarsdf.io.cloud_writing import write_cloud
 from radarsdf.io.files import check_outputs, check_regular_file, checked_suffix
 from radarsdf.io.meshes import MESH_SUFFIXES, read_ground_truth, read_mesh, write_mesh
-from radarsdf.io.npz import arrays_of, write_scans
+from radarsdf.io.npz import arrays_of
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
 from radarsdf.map.view import View, scans_of_views
 from radarsdf.render import picture
-from radarsdf.render.figures import save_view_picture
+from radarsdf.render.figures import save_grid_picture, save_view_picture
+from radarsdf.report.writing import Subject, require_extras, write_changes_report, write_report
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import predicted
+from radarsdf.view.pages import ChangesView, Viewer
+from radarsdf.view.serving import has_display, url_of, wait
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
+_LISTED = 10  # regions, largest first
 
 
 def mesh(given: Namespace, results: Results) -> None:
@@ -117,14 +127,9 @@ def render(given: Namespace, results: Results) -> None:
         views = list(views)  # a picture shows the whole view; other formats need only the returns
     scans = scans_of_views(view for view in views if len(view))
     check(len(scans), f"{given.map} has no surface visible from there: nothing written")
-    if suffix == ".npz":
-        write_scans(out, scans)
-    elif suffix == ".ply":
-        write_cloud(out, scans)
-    else:
+    if suffix == ".png":
         save_view_picture(out, list(views))
-    count = sum(map(len, scans.points))
-    results.add_file(f"{count} returns of {len(scans)} scans", out, returns=count, scans=len(scans))
+    add_scans(results, out, scans)
 
 
 def _poses(words: list[str]) -> NDArray[np.float64]:
@@ -138,3 +143,125 @@ def _poses(words: list[str]) -> NDArray[np.float64]:
         return np.asarray(poses[np.isfinite(poses).all(axis=(1, 2))])
     refuse_if(len(numbers) not in (3, 7), "--pose takes x y z, x y z qx qy qz qw, or a file")
     return pose_matrices_of(np.array([numbers if len(numbers) == 7 else [*numbers, 0, 0, 0, 1]]))
+
+
+def view(given: Namespace, results: Results) -> None:
+    """Serve the page until Ctrl-C, after printing its address."""
+    check_address(given)
+    radar_map = load_map(given.map)
+    scans, options = _scans(given, radar_map, results), {"box": given.box, "progress": results.progress}
+    page = {"voxel_size": given.voxel, "host": given.host, "port": given.port}
+    with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer:
+        url = url_of(viewer.host, viewer.port)
+        print(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it", flush=True)
+        if has_display() if given.open is None else given.open:
+            webbrowser.open(url)
+        until_stopped(viewer.wait)
+
+
+def report(given: Namespace, results: Results) -> None:
+    """Write the page."""
+    lacking = given.holdout and not given.scans
+    refuse_if(lacking, f"--holdout {given.holdout} needs the scans: name them after the map")
+
+    require_extras()
+    check_outputs([given.out], inputs_of(given))
+    radar_map = load_map(given.map)
+    scans = findings = held_out = None
+    every_scan = _scans(given, radar_map, results)
+    if every_scan is not None:
+        findings = radarsdf.check(every_scan, config=radar_map.config)
+        scans, held_out = split(every_scan, given.holdout)
+    options = {"voxel_size_m": given.voxel, "box": given.box, "limits": mesh_limits(given)}
+    name = given.map.absolute().name
+    subject = Subject(radar_map, name, scans, held_out, findings, progress=results.progress, **options)
+    add_report(results, given.out, subject)
+
+
+def _scans(given: Namespace, radar_map: Map, results: Results) -> Scans | None:
+    if not given.locate:
+        return scans_if(given.scans, given)
+    refuse_if(not given.scans, "--locate needs the scans: name them after the map")
+    return located(radar_map, unposed_scans(given), results)
+
+
+def add_report(results: Results, path: Path, subject: Subject) -> None:
+    size = write_report(path, subject)
+    results.add(f"report of {size / 1e6:.1f} MB written to {path}", report=path, report_bytes=size)
+
+
+def compare(given: Namespace, results: Results) -> None:
+    """Compare two maps, write coloured surfaces, report changes."""
+    out, report = given.out, given.report
+    if out is not None:
+        checked_suffix(out, MESH_SUFFIXES, "meshes")
+    check_outputs([out, report], inputs_of(given))
+    if report is not None:
+        require_extras()
+    if given.view:
+        check_address(given)
+    scans = scans_if(not is_map(given.scans), given)
+    later = load_map(given.scans) if scans is None else scans
+    earlier = load_map(given.map)
+    changes = compare_maps(earlier, later, align_frames=given.align, box=given.box)
+    found = changes.report
+    results.add(found["alignment"], alignment=found["alignment"], T_before_after=changes.T_before_after)
+    results.add(found["reflectance"], reflectance=found["reflectance"])
+    areas = ", ".join(f"{name} {area:.1f}" for name, area in found["areas_m2"].items())
+    areas_m2 = {name: found[name] for name in ("areas_m2", "compared_m2")}
+    results.add(f"of {found['compared_m2']:.0f} m2 that both observed, m2: {areas}", **areas_m2)
+    regions = changes.regions(given.min_area)
+    results.add(regions=[vars(region) for region in regions])
+    rows = [["region", "m2", "x, m", "y, m", "z, m", "probability"]]
+    for region in regions[:_LISTED]:
+        numbers = (region.area_m2, *region.box.mean(axis=0), region.probability)
+        rows.append([region.words, *(f"{number:.2f}" for number in numbers)])
+    if regions:
+        results.table(rows)
+    edge_m = earlier.config.leaf_size_m
+    if out is not None:
+        changes.save(out)
+        results.add(f"{out} written", out=out)
+    if report is not None:
+        names = given.map.absolute().name, given.scans.absolute().name
+        write_changes_report(report, changes, names, edge_m, regions)
+        results.add(f"{report} written", report=report)
+    if given.view:
+        results.end()
+        with ChangesView(changes, regions, edge_m, host=given.host, port=given.port) as page:
+            print(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
+            until_stopped(wait)
+
+
+def grid(given: Namespace, results: Results) -> None:
+    """Build the grid, write its files, and draw a picture if asked for."""
+    out, heights = given.out, given.heights
+    flat = [path for path in out if path.suffix.lower() == ".yaml"]
+    for path in out:
+        checked_suffix(path, (".npz", ".bt", ".yaml"), "grids")
+    for arrays_path, suffixes in ((given.distances, DISTANCE_SUFFIXES), (given.costmap, (".npz",))):
+        if arrays_path is not None:
+            checked_suffix(arrays_path, suffixes, "arrays of a grid")
+    if given.picture is not None:
+        require("matplotlib", what="pictures need")
+    pgm = [path.with_suffix(".pgm") for path in flat]
+    named = (*out, *pgm, given.distances, given.costmap, given.picture)
+    outputs = [path for path in named if path is not None]
+    check_outputs(outputs, [given.map])
+    radar_map = load_map(given.map)
+    found = grid_of(radar_map, radar_map.extent if given.box is None else given.box, given.voxel)
+    for path in out:
+        (found.flat(*heights) if path in flat else found).save(path)
+    if given.distances is not None:
+        save_arrays(given.distances, found, found.distances())
+    if given.costmap is not None:
+        save_arrays(given.costmap, found, found.costmap())
+    if given.picture is not None:
+        save_grid_picture(given.picture, found, *heights)
+    shares = {name: float(getattr(found, name).mean()) for name in ("occupied", "free", "unknown")}
+    size = " x ".join(map(str, found.shape))
+    origin = " ".join(f"{coordinate:.2f}" for coordinate in found.origin)
+    words = ", ".join(f"{100 * share:.1f} % {name}" for name, share in shares.items())
+    values = {"shape": found.shape, "origin": found.origin, "voxel_size": found.voxel_size}
+    results.add(f"{size} voxels of {found.voxel_size:g} m from {origin}: {words}", **values, **shares)
+    results.add(f"wrote {', '.join(map(str, outputs))}", out=outputs)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -47,20 +45,14 @@ class Results:
         """Print the JSON object, if there is one. Non-finite numbers become null."""
         if self.json and not self._ended:
             self._ended = True
-            print(json.dumps(plain(self._values), indent=2, allow_nan=False), flush=True)
+            print(as_json(self._values), flush=True)
 
 
-def plain(value: Any) -> Any:
-    """Convert to what JSON can store; non-finite numbers become null."""
-    if hasattr(value, "tolist"):  # an array or a number of NumPy
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {str(name): plain(part) for name, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(part) for part in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
+def as_json(values: Any) -> str:
+    """Format as JSON, arrays as lists; non-finite numbers become null."""
+    from pydantic_core import to_json
+
+    return to_json(values, indent=2, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode()
 
 
 def warn(text: str) -> None:

@@ -1,8 +1,7 @@
-"""``radarsdf check``, ``poses`` and ``convert``: scans before a fit."""
+"""Commands on scans before a fit: ``check``, ``poses``, ``calibrate``, ``locate``, ``join`` and ``convert``."""
 
 from __future__ import annotations
 
-import json
 import math
 from argparse import Namespace
 from collections.abc import Iterable
@@ -13,20 +12,23 @@ from scipy.spatial.transform import Rotation
 
 import radarsdf
 from radarsdf import FitConfig
+from radarsdf.arrays import Floats
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
-from radarsdf.cli.inputs import inputs_of, read_scans, scans_if, scans_or_unposed
+from radarsdf.cli.inputs import inputs_of, load_map, read_scans, scans_if, scans_or_unposed
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, plain, warn
+from radarsdf.cli.results import Results, as_json, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
-from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
-from radarsdf.io.clouds import CLOUD_SUFFIXES
+from radarsdf.io.clouds import CLOUD_OUT_SUFFIXES, CLOUD_SUFFIXES, write_cloud
 from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 from radarsdf.io.meshes import MESH_SUFFIXES, holds_mesh, read_mesh, write_mesh
 from radarsdf.io.npz import write_scans
-from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
+from radarsdf.io.poses import POSE_SUFFIXES, UNPOSED, NoPoses, check_pose_times, write_poses
+from radarsdf.io.read import read
+from radarsdf.map.map import Map
 from radarsdf.poses.odometry import PosedScans
+from radarsdf.poses.rigid import transform
 from radarsdf.render.figures import save_trajectory_picture
 from radarsdf.scans import Scans
 
@@ -156,7 +158,7 @@ def calibrate(given: Namespace, results: Results) -> None:
     values = {label: vars(one) for label, one in mountings.items()}
     results.add(mountings=values)
     if given.out is not None:
-        write_whole(given.out, f"{json.dumps(plain(values), indent=2)}\n".encode())
+        write_whole(given.out, f"{as_json(values)}\n".encode())
         results.add_file(f"{len(values)} mountings", given.out)
 
 
@@ -182,10 +184,78 @@ def convert(given: Namespace, results: Results) -> None:
     among = suffix in CLOUD_SUFFIXES and folder.is_dir() and folder in out.resolve().parents
     what = "lies in the folder of the scans, where it would be read as one of them: write it elsewhere"
     check_that(not among, f"{out} {what}")
-    scans = read_scans(given)
+    add_scans(results, out, read_scans(given))
+
+
+def add_scans(results: Results, out: Path, scans: Scans) -> None:
+    """Write scans or their returns by the suffix, unless that of a picture, and print how many."""
+    suffix = out.suffix.lower()
     if suffix == ".npz":
         write_scans(out, scans)
-        returns = sum(map(len, scans.points))
-    else:
-        returns = write_cloud(out, scans)
+    # Clouds are written in one pass, without all scans in memory.
+    is_cloud = suffix in CLOUD_OUT_SUFFIXES
+    returns = write_cloud(out, scans) if is_cloud else sum(map(len, scans.points))
     results.add_file(f"{returns} returns of {len(scans)} scans", out, returns=returns, scans=len(scans))
+
+
+def locate(given: Namespace, results: Results) -> None:
+    """Localise the scans in the map, print what was found, and write the poses of the scans that were."""
+    out = given.out
+    check_poses_out(given)
+    guess = None
+    if given.guess is not None:
+        *position, yaw_deg = given.guess
+        guess = transform(np.array([0.0, 0.0, np.radians(yaw_deg)]), np.array(position))
+    scans = unposed_scans(given)
+    check_pose_times(out, scans.times_s)
+    placed = located(load_map(given.map), scans, results, guess)
+    lost = len(scans) - len(placed)
+    write_posed(out, placed, results, f"{lost} scans are lost" if lost else "")
+
+
+def unposed_scans(given: Namespace) -> Scans:
+    """Read scans that are to be localised."""
+    refuse_if(given.poses, f"scans that are localised need no poses: leave out {given.poses}")
+    return read_scans(given, UNPOSED)
+
+
+def located(radar_map: Map, scans: Scans, results: Results, guess: Floats | None = None) -> Scans:
+    """Return the scans that are found in the map, with their poses there, and print which."""
+    found = radarsdf.locate(radar_map, scans, guess=guess)
+    report = found.report
+    for note in report["notes"]:
+        warn(f"note: {note}")
+    results.add(report["verdict"], **report, explained=found.explained, segments=found.segments)
+    for why in report["lost"]:
+        results.add(f"lost: {why}")
+    placed = scans.with_poses(np.nan_to_num(found.poses), other_world=True)
+    return placed.select(np.flatnonzero(found.segments >= 0))
+
+
+def join(given: Namespace, results: Results) -> None:
+    """Find the poses of the sessions in one frame, and write those that belong together."""
+    folder, paths = given.out, given.sessions
+    refuse_if(len(paths) < 2, "join takes at least two sessions")
+    names = [f"{path.resolve().stem}.npz" for path in paths]
+    differ = len(set(names)) == len(names)
+    check_that(differ, f"the sessions must have different names, not {', '.join(names)}")
+    folder.mkdir(exist_ok=True)
+    check_outputs([folder / name for name in names], paths)
+    sessions = []
+    for path in paths:
+        try:
+            sessions.append(read(path))
+        except NoPoses:
+            scans = read(path, UNPOSED)
+            sessions.append(scans.with_poses(np.full((len(scans), 4, 4), np.nan), other_world=True))
+    found = radarsdf.join(sessions, config=load_config(given))
+    results.add(found.report["verdict"], joined=[names[i] for i in found.report["joined"]])
+    rows = [["session", "session", "verdict"]]
+    rows += [[names[i], names[k], verdict] for (i, k), verdict in found.verdicts.items()]
+    results.table(rows)
+    results.add(pairs=rows[1:])
+    for i in found.report["joined"]:
+        known = np.isfinite(found.poses[i]).all(axis=(1, 2))
+        posed = sessions[i].with_poses(np.nan_to_num(found.poses[i]), other_world=True)
+        write_scans(folder / names[i], posed.select(np.flatnonzero(known)))
+        results.add_file(f"{known.sum()} scans", folder / names[i])

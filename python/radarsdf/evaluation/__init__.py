@@ -6,8 +6,7 @@ The functions take meshes and arrays, not maps, so they apply equally to the res
 
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 
-from .calibration import confidence_metrics, uncertainty_metrics
-from .intensity import KNNIntensity, holdout, intensity_metrics
+from .predictions import KNNIntensity, confidence_metrics, holdout, intensity_metrics, uncertainty_metrics
 from .surface import format_metrics, surface_metrics
 from .trajectory import trajectory_metrics
 

@@ -11,6 +11,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf._core import cell_keys
 from radarsdf.arrays import Bools, Floats, Floats32, Ints
 from radarsdf.checks import check
 from radarsdf.io.files import check_outputs, checked_suffix, write_whole
@@ -62,10 +63,8 @@ def write_octomap(path: Path, state: NDArray[np.int8], origin: Floats, voxel_m: 
 def _octree(keys: Ints, codes: Ints) -> tuple[int, bytes]:
     """Encode voxels (N, 3) with codes (N,): number of nodes, and two bytes for each inner node in depth-first order."""
     # The two bytes are the codes of its eight children, x varying fastest; 0: unknown.
-    numbers = np.zeros(len(keys), np.int64)  # Morton codes
-    for bit in range(_LEVELS):
-        for axis in range(3):
-            numbers |= (keys[:, axis] >> bit & 1) << (3 * bit + axis)
+    numbers = cell_keys(np.ascontiguousarray(keys + 0.5), 1.0).astype(np.int64)  # Morton codes
+    numbers &= (1 << 3 * _LEVELS) - 1  # of the levels
     size, firsts, levels, words = int(len(keys) > 0), [], [], []
     for level in range(1, _LEVELS + 1):
         parents, where = np.unique(numbers >> 3, return_inverse=True)

@@ -11,8 +11,7 @@ import numpy as np
 
 from radarsdf.arrays import Array, Floats
 from radarsdf.checks import check
-from radarsdf.io.text import are_degrees
-from radarsdf.io.units import factor_of, known_factor, without_unit
+from radarsdf.io.text import are_degrees, factor_of, known_factor, without_unit
 from radarsdf.scans import Columns, Notes, Scan, finite_returns
 
 _XYZ = ("x", "y", "z")

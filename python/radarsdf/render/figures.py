@@ -151,13 +151,18 @@ def save_trajectory_picture(
     figure = new_figure(figsize=size_in, dpi=120, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
     axes.scatter(*world.T, s=0.6, c="#b9b9b9", linewidths=0, rasterized=True)
-    widths = np.linspace(3.5, 1.5, len(paths)) if len(paths) > 1 else [1.8]
-    for (name, xy), color, line_width in zip(paths.items(), _TRAJECTORY_COLORS, widths, strict=False):
-        axes.plot(*xy.T, color=color, linewidth=line_width, label=name)
-        axes.plot(*xy[0], "o", color=color, markersize=5)
+    draw_trajectories(axes, paths)
     axes.set_xlim(low[0] - 0.03 * width, high[0] + 0.03 * width)
     axes.set_ylim(low[1] - 0.03 * height, high[1] + 0.03 * height)
-    axes.set_aspect("equal")
+    write_whole(path, png_of(figure))
+
+
+def draw_trajectories(axes: Any, paths: Mapping[str, Floats]) -> None:
+    """Draw positions (F, 2) or (F, 3), m, by name from above, later ones thinner; a circle marks the first scan."""
+    widths = np.linspace(1.5, 3.0, len(paths))[::-1]
+    for (name, path), color, line_width in zip(paths.items(), _TRAJECTORY_COLORS, widths, strict=False):
+        axes.plot(*path[:, :2].T, color=color, linewidth=line_width, label=name)
+        axes.plot(*path[0, :2], "o", color=color, markersize=5)
+    axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="x, m", ylabel="y, m")
     axes.legend(loc="best", frameon=True)
-    write_whole(path, png_of(figure))

@@ -1,42 +1,124 @@
-"""The report on a map."""
+"""Reports on maps and on changes. The templates in `templates/` hold all prose; Jinja escapes every value."""
 
 from __future__ import annotations
 
-import itertools
+import base64
+import io
+import math
+import re
+import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
+from radarsdf.arrays import Array, Bytes, Floats
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
+from radarsdf.checking.recording import Finding
 from radarsdf.checks import AnyPath
 from radarsdf.config.fit_config import FitConfig, flat_settings
 from radarsdf.config.toml import to_toml
-from radarsdf.report import plots
-from radarsdf.report.errors import error_values, intensity_values, uncertainty_values
-from radarsdf.report.page import fixed, require_extras, write_page
-from radarsdf.report.subject import MAX_VERTICES, Subject
-from radarsdf.report.surface import scene, surface_values, views
+from radarsdf.evaluation import intensity_metrics, surface_metrics, uncertainty_metrics
+from radarsdf.extras import require
+from radarsdf.io.files import write_whole
+from radarsdf.map.colors import NEUTRAL
+from radarsdf.map.map import Map
+from radarsdf.map.threshold import Threshold
+from radarsdf.render.figures import draw_trajectories, new_figure, png_of
+from radarsdf.render.picture import eye_around, middle_of, render
+from radarsdf.returns.moving import rays_as_measured
+from radarsdf.scans import Scans
+from radarsdf.threads import resolve_num_threads
+from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import MEANING, centre_of
-from radarsdf.view.surface import thinned
+from radarsdf.view.serving import framing_pose, free_port, set_initial_camera, start_server, stop_server
+from radarsdf.view.surface import Scale, glb, templates_of, thinned
 
-_COUNTS = {
-    "tiles": "Tiles",
-    "returns": "Returns",
-    "ghosts": "Ghosts, left out of the surface",
-    "moving": "Moving returns, left out",
-    "intensity_outliers": "Intensity outliers, left out of the reflectance",
-    "leaf_cells": "Leaf cells",
-    "vertices": "Cell vertices",
-}
-_DURATIONS = {
-    "prepare_s": "Scan checks",
-    "ghosts_s": "Planes, sensor noise, ghosts",
-    "occupied_cells_s": "Cells and averaged surface",
-    "start_s": "Initial values, evidence of the cells",
-    "training_s": "Training",
-}
-_MAX_LISTED = 50
+MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
+_WIDTH, _HEIGHT = 1040, 650  # pixels
+_SCENE_ASPECT = 8 / 5  # aspect ratio of its frame on any screen, see the style in page.html
+_STEPS_PER_M = 1024  # vertices are rounded to multiples of 1 m / 1024: fewer digits save a sixth of the file
+_SENSOR_COLOR = (0, 114, 178)
+# The icon holds the only address of another machine in viser's page, though only as the name of an XML namespace.
+_ICON = re.compile(r'<link\s+rel="icon".*?/>', re.DOTALL)
+_FIRST_SIDE = (25.0, 36.0)
+_SIDES = {
+    "One long side": _FIRST_SIDE,
+    "Steeply from above": (0.0, 70.0),  # not straight down: walls would be lines
+}  # azimuth and elevation of each view, degrees
+_FIRST, _SECOND = "#0072b2", "#d55e00"  # distinguishable by colour-blind readers
+_SAMPLES = 1_000_000
+_MATCH_M = 0.4  # a vertex farther from the truth is an outlier rather than an inaccurate surface
+_MIN_MATCHES = 100
+_MAX_RETURNS = 100_000  # evenly spread; more would not change a plot
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A map and the data it is compared with."""
+
+    radar_map: Map
+    name: str  # title of the page
+    scans: Scans | None = None  # those fitted, or those to compare with
+    held_out: Scans | None = None  # those that the fit left out, if known
+    findings: Sequence[Finding] | None = None  # result of `radarsdf.check` on all scans; None: not checked
+    voxel_size_m: float = 0.1  # voxels of the evaluated mesh
+    box: ArrayLike | None = None  # (2, 3) corners of the reported part of the world, m; None: all
+    progress: bool | None = None
+    limits: Mapping[str, Any] = field(default_factory=dict)  # limits of the mesh: arguments of `Map.mesh`
+
+    @property
+    def viewpoint(self) -> Floats:
+        """(3,) sensor position for predicted intensities: that of the middle scan, or the map's origin; world, m."""
+        if self.scans is None:
+            return self.radar_map.origin
+        return np.asarray(self.scans.sensor_poses[len(self.scans) // 2, :3, 3], np.float64)
+
+    @cached_property
+    def mesh(self) -> Any:
+        """The evaluated mesh, with intensities if the map has any."""
+        viewpoint = self.viewpoint if self.radar_map.has_intensity else None
+        limits: dict[str, Any] = {**self.limits, "box": self.box, "viewpoint": viewpoint}
+        return self.radar_map.mesh(self.voxel_size_m, progress=self.progress, **limits)
+
+    @cached_property
+    def shown(self) -> tuple[Any, float]:
+        """The drawn mesh, and its vertex spacing, m."""
+        return thinned(self.mesh, MAX_VERTICES, self.voxel_size_m)
+
+    @cached_property
+    def ground_truth(self) -> Floats | None:
+        """(M, 3) ground-truth points in the box, world, m; None if there are none."""
+        if self.scans is None or self.scans.ground_truth is None:
+            return None
+        truth = np.asarray(self.scans.ground_truth, np.float64)
+        if self.box is not None:
+            low, high = np.asarray(self.box, np.float64)
+            truth = truth[((truth >= low) & (truth <= high)).all(axis=1)]
+        return truth if len(truth) else None
+
+    def nearest_truth(self, vertices: ArrayLike) -> tuple[Floats, Any]:
+        """Distances (V,), m, to the nearest ground-truth points, which must exist, and their rows."""
+        distance_m, rows = self._truth_tree.query(vertices, workers=resolve_num_threads(0))
+        return distance_m, rows
+
+    @cached_property
+    def _truth_tree(self) -> Any:
+        return cKDTree(self.ground_truth)
+
+    def picture(self, values: Array, label: str, scale: Scale) -> dict[str, Any]:
+        """Render the drawn mesh coloured by values (V,) of its vertices, and describe the colours."""
+        colors, legend = _colored(self.shown[0], values, label, scale)
+        return {"picture": _picture(self.shown[0], colors), "legend": legend}
+
+
+def require_extras() -> None:
+    """Raise an ImportError with the install command if matplotlib or viser is missing."""
+    require("matplotlib", "viser", what="a report needs")
 
 
 def write_report(path: AnyPath, subject: Subject) -> int:
@@ -44,54 +126,20 @@ def write_report(path: AnyPath, subject: Subject) -> int:
     require_extras()
     report = subject.radar_map.report
     settings, defaults = (flat_settings(of.to_dict()) for of in (subject.radar_map.config, FitConfig()))
-    return write_page(
+    return _write_page(
         path,
         "report.html",
         subject=subject,
         report=report,
-        noise=report.get("noise"),
         fit_s=sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s"),
-        problems=[finding for finding in subject.findings or () if finding.severity != "note"],
         poses=pose_values(report.get("poses")),
         surface=surface_values(subject),
         errors=error_values(subject),
         uncertainty=uncertainty_values(subject),
         intensity=intensity_values(subject),
-        training=_training(report),
-        durations=[(name, fixed(report[key], 2, "s")) for key, name in _DURATIONS.items() if key in report],
-        skipped=[
-            (name, "–" if seconds is None else f"about {seconds:.1f} s")
-            for name, seconds in itertools.zip_longest(report.get("skipped", []), report.get("skipped_s", []))
-        ],
         changed=[(n, value, defaults[n]) for n, value in settings.items() if value != defaults[n]],
         toml=to_toml(subject.radar_map.config),
     )
-
-
-def pose_values(poses: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Values of the section on estimated poses. `poses`: their part of a map's report, None for poses used as passed."""
-    if poses is None:
-        return None
-    after = np.array(poses["after"])
-    before = None if poses["before"] is None else np.array(poses["before"])
-    sigma_m, sigma_deg = np.median(poses["sigma_m"]), np.degrees(np.median(poses["sigma_rad"]))
-    return {
-        "verdict": poses["verdict"],
-        "improved": poses["improved"],
-        "trajectory": plots.trajectory(before, after),
-        "sigma": (sigma_m, sigma_deg) if sigma_m else None,
-        "length_m": np.linalg.norm(np.diff(after, axis=0), axis=1).sum(),
-        "moved_m": None if before is None else np.linalg.norm(after - before, axis=1),
-    }
-
-
-def _training(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    rows = [(name, f"{report[key]:,}") for key, name in _COUNTS.items() if key in report]
-    if missing := report.get("missing_tiles"):
-        rows.append(("Missing tiles", ", ".join(missing)))
-    for stage, done in report.get("iterations_done", {}).items():
-        rows.append((f"Iterations, {stage}", f"{done:,} of {report['iterations'][stage]:,}"))
-    return rows
 
 
 def write_changes_report(
@@ -110,11 +158,221 @@ def write_changes_report(
         vertices = np.asarray(mesh.vertices, np.float64)
         local = vertices - vertices.mean(axis=0)
         surface = {"scene": scene(local, mesh.faces, colors), "views": views(mesh, colors)}
-    rows = []
-    for number, region in enumerate(regions[:_MAX_LISTED], 1):
-        size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
-        numbers = fixed(region.area_m2, 2), fixed(region.probability, 2)
-        rows.append((number, region.words, centre_of(region), size, *numbers))
-    values = {"report": changes.report, "regions": regions, "rows": rows, "max_listed": _MAX_LISTED}
-    kinds = [NAMES[kind] for kind in CHANGED]
-    return write_page(path, "changes.html", names=names, surface=surface, key=MEANING, kinds=kinds, **values)
+    values = {"report": changes.report, "regions": regions, "kinds": [NAMES[kind] for kind in CHANGED]}
+    return _write_page(path, "changes.html", names=names, surface=surface, key=MEANING, **values)
+
+
+def surface_values(subject: Subject) -> dict[str, Any] | None:
+    """Values of the surface section, or None if there is no surface."""
+    mesh, spacing_m = subject.shown
+    if len(mesh.faces) == 0:
+        return None
+    colors, legend = _colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
+    origin = subject.radar_map.origin
+    sensors = None if subject.scans is None else subject.scans.sensor_poses[:, :3, 3] - origin
+    return {
+        "scene": scene(np.asarray(mesh.vertices, np.float64) - origin, mesh.faces, colors, sensors),
+        "legend": legend,
+        "views": views(mesh, colors),
+        "threshold": Threshold.of_mesh(subject.mesh.metadata),
+        "shown_triangles": len(mesh.faces),
+        "spacing_m": spacing_m,
+    }
+
+
+def error_values(subject: Subject) -> dict[str, Any] | None:
+    """Values of the section of surface errors, or None without a truth or a surface."""
+    truth, mesh = subject.ground_truth, subject.mesh
+    if truth is None or len(mesh.faces) == 0:
+        return None
+    metrics = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
+    shown_m, _ = subject.nearest_truth(subject.shown[0].vertices)
+    pictured = subject.picture(shown_m, "distance to the truth, m", Scale(0.0, _MATCH_M))
+    return {"metrics": metrics, **pictured}
+
+
+def uncertainty_values(subject: Subject) -> dict[str, Any] | None:
+    """Values of the uncertainty section, or None if there is no surface."""
+    mesh, (shown, _) = subject.mesh, subject.shown
+    if len(mesh.faces) == 0:
+        return None
+    sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
+    shown_m, percentiles = shown.vertex_attributes["uncertainty_m"], [10, 50, 90]
+    return {
+        **subject.picture(shown_m, "standard error, m", Scale.of(sigma_m)),
+        "percentiles": percentiles,
+        "sigma_m": np.nanpercentile(sigma_m, percentiles).tolist(),
+        "confidence": np.nanpercentile(mesh.vertex_attributes["confidence"], percentiles).tolist(),
+        "against_truth": _calibration(subject, sigma_m),
+    }
+
+
+def _calibration(subject: Subject, sigma_m: Floats) -> dict[str, Any] | None:
+    """Errors compared with predicted uncertainties, or None if too little of the surface is near the truth."""
+    mesh, truth = subject.mesh, subject.ground_truth
+    if truth is None:
+        return None
+    vertices = np.asarray(mesh.vertices, np.float64)
+    distance_m, nearest = subject.nearest_truth(vertices)
+    error_m = ((truth[nearest] - vertices) * np.asarray(mesh.vertex_normals)).sum(axis=1)
+    error_m[distance_m > _MATCH_M] = np.nan
+    if np.count_nonzero(np.isfinite(error_m) & np.isfinite(sigma_m)) < _MIN_MATCHES:
+        return None
+    metrics = uncertainty_metrics(error_m, sigma_m)
+    predicted_m, measured_m = metrics["decile_predicted_m"], metrics["decile_rmse_m"]
+    figure, ax = _subplots()
+    most = 1.1 * max(*predicted_m, *measured_m)
+    ax.plot([0, most], [0, most], color="gray", linestyle="--", linewidth=1, label="ideal")
+    ax.plot(predicted_m, measured_m, "o-", color=_FIRST, markersize=4, label="this map")
+    ax.set(xlabel="predicted uncertainty, m", ylabel="RMS error, m", xlim=(0, most), ylim=(0, most))
+    ax.legend(frameon=False, loc="upper left")
+    matched = {"matched": metrics["num_points"] / len(vertices), "match_m": _MATCH_M}
+    return metrics | matched | {"plot": _png(figure)}
+
+
+def intensity_values(subject: Subject) -> dict[str, Any] | None:
+    """Values of the intensity section, on held-out scans if there are any. None if there is nothing to compare."""
+    scans = subject.scans if subject.held_out is None else subject.held_out
+    if not subject.radar_map.has_intensity or scans is None or scans.intensities is None:
+        return None
+    every_ray = rays_as_measured(scans, subject.radar_map.config)
+    usable = every_ray.select(every_ray.with_intensity)
+    rows = np.linspace(0, len(usable) - 1, min(len(usable), _MAX_RETURNS)).astype(np.int64)
+    rays, found = predicted(subject.radar_map, usable.select(rows))
+    assert rays.intensities is not None
+    measured = rays.intensities.astype(np.float64)
+    metrics = intensity_metrics(found, measured)
+    deviation = np.abs(measured - np.median(measured))
+    return {
+        "scans": len(scans),
+        "returns": len(rays),
+        "left_out": {"outliers": len(every_ray) - len(usable), "in no tile": len(rows) - len(rays)},
+        "errors": [metrics["mae"], metrics["medae"]],
+        "errors_of_median": [float(deviation.mean()), float(np.median(deviation))],
+        "density": _density(measured, found),
+    }
+
+
+def _density(measured: Floats, found: Floats) -> bytes:
+    """Plot the density of predicted over measured intensities (N,), with the diagonal."""
+    from matplotlib.colors import LogNorm  # noqa: PLC0415 - an extra
+
+    figure, ax = _subplots()
+    low, high = np.percentile(np.concatenate([measured, found]), [0.2, 99.8])
+    high = max(high, low + 1e-6)
+    bins = np.linspace(low, high, 61)
+    *_, drawn = ax.hist2d(measured, found, bins, cmap="viridis", norm=LogNorm(), cmin=1)
+    ax.plot([low, high], [low, high], color=_SECOND, linewidth=1.5, label="equal")
+    ax.set(xlabel="measured intensity", ylabel="predicted intensity", xlim=(low, high), ylim=(low, high))
+    ax.legend(frameon=False, loc="upper left")
+    figure.colorbar(drawn, label="returns", pad=0.02)
+    return _png(figure)
+
+
+def pose_values(poses: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Values of the section on estimated poses. `poses`: their part of a map's report, None for poses used as passed."""
+    if poses is None:
+        return None
+    after = np.array(poses["after"])
+    before = None if poses["before"] is None else np.array(poses["before"])
+    sigma_m, sigma_deg = np.median(poses["sigma_m"]), np.degrees(np.median(poses["sigma_rad"]))
+    figure, ax = _subplots()
+    draw_trajectories(ax, {"after": after} if before is None else {"before": before, "after": after})
+    return {
+        "verdict": poses["verdict"],
+        "improved": poses["improved"],
+        "trajectory": _png(figure),
+        "sigma": (sigma_m, sigma_deg) if sigma_m else None,
+        "length_m": np.linalg.norm(np.diff(after, axis=0), axis=1).sum(),
+        "moved_m": None if before is None else np.linalg.norm(after - before, axis=1),
+    }
+
+
+def _subplots() -> tuple[Any, Any]:
+    """Create a figure with axes, small enough for text to stay legible on a phone."""
+    figure = new_figure(figsize=(4.4, 3.3), dpi=180, layout="constrained", facecolor="white")
+    return figure, figure.subplots()
+
+
+def _png(figure: Any) -> bytes:
+    for ax in figure.axes:
+        if ax.get_label() != "<colorbar>":
+            ax.grid(alpha=0.3)
+            ax.spines[["top", "right"]].set_visible(False)
+    return png_of(figure, metadata={"Software": None})
+
+
+def _colored(
+    mesh: Any, values: Array | None, label: str, scale: Scale | None = None
+) -> tuple[Bytes, dict[str, Any] | None]:
+    """Map values (V,) of the vertices to colours (V, 3), with a legend. NaN is grey, as is everything without values."""
+    if values is None or not np.isfinite(values).any():
+        return np.full((len(mesh.vertices), 3), NEUTRAL, np.uint8), None
+    scale = scale or Scale.of(values)
+    return scale(values), {"label": label, "scale": scale}
+
+
+def views(mesh: Any, colors: Bytes) -> dict[str, bytes]:
+    """Render a mesh with vertex colours (V, 3) from each of its sides, by name."""
+    return {name: _picture(mesh, colors, *side) for name, side in _SIDES.items()}
+
+
+def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
+    """Render a mesh with vertex colours (V, 3), seen from :func:`eye_around`, as JPEG."""
+    from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
+
+    eye = eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg)
+    pixels = render(mesh, colors, width=_WIDTH, height=_HEIGHT, viewpoint=eye)
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="jpeg", quality=82, optimize=True)
+    return file.getvalue()
+
+
+def scene(vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None = None) -> str:
+    """Export a self-contained HTML page that shows a mesh in 3D, made by viser.
+
+    `vertices` (V, 3) and `sensors` (F, 3), drawn as points, are in m near the origin, since the page computes in
+    float32. viser exports the scene of a server, which listens on this machine for less than a second. The addresses of
+    other machines in its program are never used; the report's content security policy forbids fetching them.
+    """
+    everything = vertices if sensors is None else np.concatenate([vertices, sensors])
+    to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
+    pose = framing_pose(everything, to_eye, _SCENE_ASPECT)
+    host = "127.0.0.1"
+    server: Any = start_server(host, free_port(host, 0))
+    try:
+        data = glb(np.round(vertices * _STEPS_PER_M) / _STEPS_PER_M, faces, colors)
+        server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
+        if sensors is not None:
+            size = 0.008 * float(np.linalg.norm(pose.position - pose.look_at))
+            style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
+            server.scene.add_point_cloud("/sensor", sensors.astype(np.float32), _SENSOR_COLOR, **style)
+        set_initial_camera(server, pose)
+        document: str = server.get_scene_serializer().as_html()
+    finally:
+        stop_server(server)
+    return _ICON.sub("", document)
+
+
+def _write_page(path: AnyPath, template: str, **values: Any) -> int:
+    """Fill a template and write the page atomically. Returns the size of the file, bytes."""
+    made = time.strftime("%Y-%m-%d %H:%M")
+    environment, filters = templates_of("report"), (centre_of, data_uri, fixed, math.degrees, percent)
+    environment.filters |= {own.__name__: own for own in filters}
+    data = environment.get_template(template).render(made=made, **values).encode()
+    write_whole(path, data)
+    return len(data)
+
+
+def fixed(value: float, digits: int, unit: str = "") -> str:
+    """Format a number with a fixed number of decimals and its unit."""
+    return f"{value:,.{digits}f}" + (unit if unit in ("", "°") else "\N{NO-BREAK SPACE}" + unit)
+
+
+def percent(share: float) -> str:
+    return fixed(100 * share, 1, "%")
+
+
+def data_uri(image: bytes) -> str:
+    kind = "png" if image.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"

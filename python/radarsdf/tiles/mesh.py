@@ -18,8 +18,7 @@ from tqdm import tqdm
 from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import AnyPath, check, check_box, hides_bar, path_of, positive
 from radarsdf.io.files import check_outputs, checked_suffix, reading, write_whole
-from radarsdf.io.glb import MATT, T_GLTF_WORLD, encode_glb
-from radarsdf.io.meshes import MESH_SUFFIXES, write_mesh
+from radarsdf.io.meshes import MATT, MESH_SUFFIXES, T_GLTF_WORLD, encode_glb, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice

@@ -19,9 +19,8 @@ from radarsdf.arrays import Array, Bytes, Floats, Ints
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
-from radarsdf.view.quantities import Position, Quantity, Scale
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
-from radarsdf.view.surface import ShownSurface, glb, shaded, spread_evenly
+from radarsdf.view.surface import Position, Quantity, Scale, ShownSurface, glb, shaded, spread_evenly
 
 HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
 SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one

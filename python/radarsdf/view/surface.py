@@ -1,18 +1,22 @@
-"""Surface of a page, thinned to what a browser can draw, and hits of clicks on it."""
+"""Surface of a page, thinned to what a browser can draw, hits of clicks on it, and the quantities that colour it."""
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jinja2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check, whole_number
-from radarsdf.io.glb import MATT, SRGB_TO_LINEAR, encode_glb
+from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
+from radarsdf.map.colors import intensity_colors
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
 
@@ -22,6 +26,9 @@ if TYPE_CHECKING:
     from radarsdf.map.map import Map
 
 
+Position = tuple[float, float, float]
+
+_SAMPLES = 30_000  # vertices from which the intensity limits are estimated
 _MIN_VERTICES = 1000  # smallest max_vertices: fewer show nothing useful
 # Colours as they are, like those of point clouds and legends.
 _UNLIT = MATT | {"extensions": {"KHR_materials_unlit": {}}}
@@ -148,3 +155,84 @@ def light_to_show(colors: Bytes) -> Floats32:
     bits = light.view(np.uint32)
     half = np.uint32(1) << (_BITS - np.uint32(1))
     return ((bits + half) >> _BITS << _BITS).view(np.float32)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A fixed scale of sRGB colours from `low` to `high`; NaN is grey."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Array) -> Scale:
+        """Build from the 2nd and the 98th percentile of values (N,)."""
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
+        return cls(float(low), float(high))
+
+    def __call__(self, values: Array) -> Bytes:
+        """(N, 3) sRGB of values (N,)."""
+        return intensity_colors(values, self.low, self.high)[:, :3]
+
+    @property
+    def css(self) -> str:
+        """The colours from low to high, as CSS."""
+        return ",".join(map(css_color, intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3].tolist()))
+
+
+@dataclass(frozen=True)
+class Quantity:
+    label: str  # name and unit
+    values: Callable[[Ints, Position], Array]  # (N,) of vertices (N,), for a sensor at a position
+    scale: Scale
+    of_sensor: bool = False  # whether it depends on the sensor position
+
+    def colors(self, rows: Ints, sensor: Position) -> Bytes:
+        """(N, 3) sRGB of vertices (N,)."""
+        return self.scale(self.values(rows, sensor))
+
+
+def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
+    """Quantities by name, the default first. The intensity scale is that for the first `sensor` position."""
+    vertices, found = surface.vertices, {}
+
+    def intensity(rows: Ints, sensor: Position) -> Array:
+        return radar_map.intensity(vertices[rows], np.array(sensor))
+
+    if radar_map.has_intensity:
+        some = np.arange(0, len(vertices), max(1, len(vertices) // _SAMPLES))
+        scale = Scale.of(intensity(some, sensor))
+        found["intensity"] = Quantity("predicted intensity, sensor units", intensity, scale, of_sensor=True)
+    of_vertices: dict[str, tuple[str, Array]] = {
+        "uncertainty": ("uncertainty (standard error), m", surface.uncertainty_m),
+        "confidence": ("confidence (probability)", surface.confidence),
+        "height": ("height, m", vertices[:, 2]),
+    }
+    for name, (label, values) in of_vertices.items():
+        scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
+        found[name] = Quantity(label, lambda rows, _, values=values: values[rows], scale)  # type: ignore[misc]
+    return found
+
+
+def as_html(name: str, value: Any) -> str:
+    """Fill a macro of ``templates/panel.html``, such as "legend"."""
+    return str(getattr(templates_of("view").get_template("panel.html").module, name)(value))
+
+
+@functools.cache
+def templates_of(subpackage: str) -> jinja2.Environment:
+    """Environment of the templates of a subpackage, which escapes all values."""
+    options: dict[str, Any] = {
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+        "undefined": jinja2.StrictUndefined,
+    }
+    loader, extensions = jinja2.PackageLoader(f"radarsdf.{subpackage}"), ["jinja2.ext.do"]
+    environment = jinja2.Environment(loader=loader, autoescape=True, extensions=extensions, **options)
+    environment.filters["css_color"] = css_color
+    return environment
+
+
+def css_color(color: Sequence[int]) -> str:
+    return "rgb({} {} {})".format(*color)
