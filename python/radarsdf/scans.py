@@ -203,7 +203,7 @@ class Scans:
     @property
     def sensors(self) -> list[Label] | None:
         """F labels of the radars of the scans; None if there is one radar."""
-        return None if self.rig is None else self.rig.sensors
+        return None if self.rig is None else [self.rig.labels[i] for i in self.rig.of_scan]
 
     @property
     def T_body_sensor(self) -> dict[Label, Floats] | None:

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from radarsdf.checking.frames import hypotheses
-from radarsdf.poses.agreement import Agreement, Gain, choose_pairs, pairs_apart
+from radarsdf.poses.agreement import Agreement, choose_pairs, pairs_apart
 from scipy.spatial.transform import Rotation
 
 PAIRS = np.array([[0, 1], [1, 3]])
@@ -118,16 +118,6 @@ def test_scores_against_a_plain_calculation():
     assert agreement.spacing_m(0) == pytest.approx(np.median(own))
     few = Agreement([scans[0][:6], scans[0][:5]], 60, 60)
     assert few.spacing_m(0) > 0 == few.spacing_m(1)
-
-
-def test_a_gain_has_the_standard_error_of_its_mean():
-    given, other = np.array([1.0, 2.0, 4.0, 3.0]), np.array([[0.5, 1.0, 2.0, 2.5]])
-    found = Gain.over(given, other)
-    better = given - other[0]
-    assert found.mean[0] == pytest.approx(better.mean())
-    assert found.error[0] == pytest.approx(better.std(ddof=1) / 2)
-    assert found.significance[0] == pytest.approx(better.mean() / (better.std(ddof=1) / 2))
-    assert Gain.over(given[:1], other[:, :1]).significance[0] == 0  # a single pair is no evidence
 
 
 def test_pairs_are_neighbours_and_scans_after_a_displacement():

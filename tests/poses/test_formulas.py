@@ -10,6 +10,7 @@ from radarsdf import FitConfig, RefinedPoses
 from radarsdf.poses.agreement import (
     CLEAR,
     ERRORS,
+    Gain,
     Verdict,
     _crowding,
     _gains,
@@ -290,6 +291,7 @@ def test_a_gain_is_significant_by_students_t():
     assert not Verdict(0.00099, 0.0, 9).improved
     assert not Verdict(0.1, 0.0, 9, crowding=0.2).improved
     assert Verdict.by_groups(gains[:2], groups[:2]).needed == np.inf
+    assert Gain.over(gains[:1], gains[None, 1:2]).significance[0] == 0  # a single pair is no evidence
     assert Verdict(0.5, 0.0, 2).improved
     assert "by +50.00%, by chance and overlap alone up to 0.10%" in Verdict(0.5, 0.0, 2).words
 

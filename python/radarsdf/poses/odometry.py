@@ -251,12 +251,11 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
 
     moved, turned = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
     removed = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
-    doppler = "their Doppler (doppler_mps)"
+    unsure = any(note.startswith(NOT_USED) for note in notes)
+    doppler = "Doppler that most returns of a scan agree on" if unsure else "their Doppler (doppler_mps)"
     # Minimum share of the prior variance of a step's rotation that the returns must remove: over the window of scans, it adds up
     # to all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
     least_turned = 1 / drive.window
-    if any(note.startswith(NOT_USED) for note in notes):
-        doppler = "Doppler that most returns of a scan agree on"
     if drive.velocities is None and moved < LEAST_OBSERVED:
         refuse("moved", removed.format(moved, LEAST_OBSERVED), doppler)
     durations_s, velocities = np.diff(drive.times_s), drive.velocities
@@ -271,12 +270,10 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
         if (significance := motion_significance(drive.scans, within, motions)) < -ERRORS:
             refuse("moved", "scans agree better without any motion", doppler)
         if significance < ERRORS:
-            what = "neighbouring scans agree as well without any motion"
-            assumed.append(f"Assumed: the sensor moved as estimated; {what}.")
+            assumed.append("Assumed: the sensor moved as estimated; scans agree as well without any motion.")
     if unknown:
-        why = f"as {LATERAL_MPS2:.0f} m/s² across its trajectory make of its speed"
-        what = f"the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, {why}"
-        assumed.append(f"Assumed: {what}; the returns of a scan hardly measure it.")
+        rate = f"{drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its trajectory make of its speed"
+        assumed.append(f"Assumed: the sensor turns by about {rate}; the returns of a scan hardly measure it.")
     return assumed
 
 
