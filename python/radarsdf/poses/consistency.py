@@ -141,7 +141,7 @@ class Clock:
 
 def delay_of(
     velocities: SensorVelocities,
-    runs: Ints,  # of scans without a gap
+    runs: Ints,
     rows: Ints,
     motion: DopplerMotion,
     shown: Floats,
@@ -151,7 +151,7 @@ def delay_of(
 ) -> tuple[int, tuple[int, ...]]:
     """Return the delay, scans, of the Doppler with which steps (K, 3) by another source agree best, if significantly; else 0.
 
-    And those that are not excluded. `velocities` and `runs`: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of
+    And those that are not excluded. `velocities` and `runs` without a gap: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of
     `shown`; `seen` (K, 3): the shares of its differences from `motion` that it shows, since it has a prior from this motion.
     """
     # The steps by delayed Doppler explain the residuals of those by its own (J test, Davidson and MacKinnon 1981).
