@@ -198,7 +198,7 @@ def test_a_sensor_moves_if_its_velocity_is_five_deviations_from_zero():
 
 def test_a_velocity_of_undetermined_sign_is_zero_with_its_speed_as_deviation():
     mean, covariance = np.array([[3.0, 4, 0], [0, 1, 2]]), np.tile(0.01 * np.eye(3), (2, 1, 1))
-    velocities = SensorVelocities(mean, covariance, np.ones(3), [], np.ones(2, bool))
+    velocities = SensorVelocities(mean, covariance, np.ones(3), np.ones(2, bool))
     for sign in (1, -1):
         found = _signed(velocities, sign)
         np.testing.assert_array_equal(found.mean_mps, sign * mean)

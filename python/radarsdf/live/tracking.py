@@ -346,9 +346,8 @@ class Follower:
         change = MOVES.change
         if len(known) > 1:
             change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (times_s[-1] - times_s[0])
-        static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
-        velocities = _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
+        velocities = _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, found), sign)
         if (rig := _rig_of(steps)) is None:
             return velocities
         measured = np.array([step.velocity is not None for step in steps])

@@ -84,9 +84,10 @@ class CheckedScans:
         if offset_mps := radial_offset_mps(scans, speeds, velocities):
             why = f"{offset_mps:.2f} m/s are added to that of all returns"
             return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
-        moving = sum(int((~static).sum()) for static in velocities.static)
-        standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
-        return cls(rows, standing, times_s, begin_s, velocities, moving, notes)
+        each = zip(scans, speeds, velocities.of_scans, strict=True)
+        static = [x[one.static | np.isnan(mps)] if one.found else x for x, mps, one in each]
+        moving = sum(map(len, scans)) - sum(map(len, static))
+        return cls(rows, static, times_s, begin_s, velocities, moving, notes)
 
     @classmethod
     def of_radars(
