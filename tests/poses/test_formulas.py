@@ -299,14 +299,14 @@ def test_standard_deviations_of_poses_become_settings_of_returns():
     assert pose_sigmas(covariance) == pytest.approx((np.sqrt(3), np.sqrt(0.02)))
     poses = np.tile(np.eye(4), (5, 1, 1))
     refined = RefinedPoses(poses, covariance, True, {"verdict": ""})
-    posed = PosedScans.refined(refined, poses)
+    posed = PosedScans.of(refined, poses)
     assert (posed.rows, posed.segments) == (slice(0, 5), 1)
     found = posed.config(FitConfig()).returns
     assert (found.pose_sigma_m, found.pose_sigma_rad) == pytest.approx((np.sqrt(3), np.sqrt(0.02)))
     for name in ("pose_sigma_m", "pose_sigma_rad"):
         stated = FitConfig(returns={name: 0.3})
         assert posed.config(stated) == stated
-    assert PosedScans.refined(dataclasses.replace(refined, improved=False), poses).sigmas is None
+    assert PosedScans.of(dataclasses.replace(refined, improved=False), poses).sigmas is None
     assert dataclasses.replace(posed, sigmas=(0.1, 7.0)).config(FitConfig()).returns.pose_sigma_rad == 1.0
 
 

@@ -341,19 +341,15 @@ class PosedScans:
     notes: tuple[str, ...] = ()  # sentences on unused input
 
     @classmethod
-    def refined(cls, refined: RefinedPoses, given: Floats) -> PosedScans:
-        """Build from refined poses and the original ones (F, 4, 4). `sigmas` are unknown if these were kept."""
-        sigmas = pose_sigmas(refined.covariance) if refined.improved else None
-        rows, notes = slice(0, len(given)), tuple(refined.report.get("notes", ()))
-        return cls(refined.poses, rows, given, 1, trajectory_report(refined, given), sigmas, notes)
-
-    @classmethod
-    def found(cls, found: Odometry) -> PosedScans:
-        """Build from the longest segment of odometry."""
-        rows, report = found.longest_segment(), found.report
-        sigmas, trajectory = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
-        segments, notes = report["segments"], tuple(report["notes"])
-        return cls(found.poses[rows], rows, None, segments, trajectory, sigmas, notes)
+    def of(cls, found: RefinedPoses | Odometry, given: Floats | None = None) -> PosedScans:
+        """Build from the longest segment of odometry, or from refined poses and the original ones (F, 4, 4)."""
+        rows = found.longest_segment() if isinstance(found, Odometry) else slice(0, len(found.poses))
+        kept = isinstance(found, RefinedPoses) and not found.improved
+        sigmas = None if kept else pose_sigmas(found.covariance[rows])
+        segments, notes = found.report.get("segments", 1), tuple(found.report.get("notes", ()))
+        return cls(
+            found.poses[rows], rows, given, segments, trajectory_report(found, given, rows), sigmas, notes
+        )
 
     def config(self, config: FitConfig) -> FitConfig:
         """Return `config` with the errors of the poses, unless it specifies its own."""
