@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -177,7 +178,8 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
     both = [
         [(x, x / np.maximum(np.linalg.norm(x, axis=1), 1e-12)[:, None]) for x in of] for of in (given, moved)
     ]
-    for k, middle in enumerate((np.median, np.mean)):
+    middles: tuple[Any, ...] = (np.median, np.mean)
+    for k, middle in enumerate(middles):
         before, after = (np.array([middle(scan[k], axis=0) for scan in scans]) for scans in both)
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
@@ -212,7 +214,9 @@ def hypotheses(poses: Floats, pairs: Ints, *, all_axes: bool = True) -> Iterator
     `all_axes`: whether to try all 47 permutations and reflections of axes, of points and positions, or the eight most common.
     """
     motions, R, t = relative(poses, pairs), poses[:, :3, :3], poses[:, :3, 3]
-    yield Hypothesis("poses_inverted", "the poses are inverted", relative(np.linalg.inv(poses), pairs))
+    yield Hypothesis(
+        "poses_inverted", "the poses are inverted", relative(np.linalg.inv(poses).astype(np.float64), pairs)
+    )
     still = np.tile(np.eye(4), (len(pairs), 1, 1))
     yield Hypothesis("points_in_world_frame", "the points are in the world frame already", still)
     rotations_by_90 = Rotation.create_group("O").as_matrix().round()

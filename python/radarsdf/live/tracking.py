@@ -26,7 +26,7 @@ from radarsdf.poses.doppler import (
     upright,
 )
 from radarsdf.poses.motion import MotionRate, PredictedStep
-from radarsdf.poses.planes import plane_cell_m
+from radarsdf.poses.planes import Tracked, plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.search import Lost
 from radarsdf.poses.tracking import (
@@ -35,7 +35,6 @@ from radarsdf.poses.tracking import (
     TURNS,
     WINDOW,
     Drive,
-    Tracked,
     Tracker,
     begin_segment,
     rates_of,
