@@ -105,11 +105,6 @@ class Rig:
         return cls(labels, rows, np.stack([*checked_mountings(T_body_sensor).values()]))
 
     @property
-    def sensors(self) -> list[Label]:
-        """Label of the radar of each scan, F of them."""
-        return [self.labels[i] for i in self.of_scan]
-
-    @property
     def mountings(self) -> Floats:
         """(F, 4, 4) T_body_sensor of each scan, m; the identity if unknown."""
         if self.T_body_sensor is None:

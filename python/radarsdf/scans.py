@@ -79,8 +79,7 @@ class Notes:
     def __init__(self, about: str = "the scans") -> None:
         self.about = about  # what is read, for messages
         self.lines: list[str] = []
-        self._counts: dict[str, int] = {}
-        self._first: dict[str, str] = {}
+        self._counts: dict[str, tuple[int, str]] = {}
 
     def add(self, line: str) -> None:
         """Add a sentence, and log it if it is new."""
@@ -95,8 +94,8 @@ class Notes:
     def count(self, what: str, number: int = 1, example: str = "") -> None:
         """Count omissions in this pass through the files, and keep the first example."""
         if number:
-            self._first.setdefault(what, f"; the first: {example}" if example else "")
-            self._counts[what] = self._counts.get(what, 0) + number
+            known, first = self._counts.get(what, (0, f"; the first: {example}" if example else ""))
+            self._counts[what] = known + number, first
 
     def start_pass(self) -> None:
         """Reset the counts before the files are read again."""
@@ -104,8 +103,8 @@ class Notes:
 
     def end_pass(self) -> None:
         """Turn the counts into sentences."""
-        for what, number in self._counts.items():
-            self.add(f"{number} {what}{self._first[what]}")
+        for what, (number, first) in self._counts.items():
+            self.add(f"{number} {what}{first}")
 
 
 class Scans:
@@ -203,7 +202,7 @@ class Scans:
     @property
     def sensors(self) -> list[Label] | None:
         """F labels of the radars of the scans; None if there is one radar."""
-        return None if self.rig is None else self.rig.sensors
+        return None if self.rig is None else [self.rig.labels[i] for i in self.rig.of_scan]
 
     @property
     def T_body_sensor(self) -> dict[Label, Floats] | None:

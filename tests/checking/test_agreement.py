@@ -60,7 +60,7 @@ def expected(what):
 
 
 def test_hypotheses_move_the_scans_as_described():
-    found = hypotheses(POSES, PAIRS)
+    found = list(hypotheses(POSES, PAIRS))
     by_kind = {guess.finding: guess for guess in found}
     np.testing.assert_allclose(by_kind["poses_inverted"].T_j_i, motions(np.linalg.inv(POSES)), atol=1e-12)
     np.testing.assert_array_equal(by_kind["points_in_world_frame"].T_j_i, np.tile(np.eye(4), (2, 1, 1)))

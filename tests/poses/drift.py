@@ -24,7 +24,7 @@ def velocities_of(mean_mps, covariance):
     """Velocities (F, 3) of all scans, with the same covariance (3, 3)."""
     count = len(mean_mps)
     every = np.tile(covariance, (count, 1, 1))
-    return SensorVelocities(mean_mps, every, np.ones(3), [[]] * count, np.ones(count, bool))
+    return SensorVelocities(mean_mps, every, np.ones(3), np.ones(count, bool))
 
 
 def position_error_m(poses, true):

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.poses.agreement import (
     CLEAR,
+    Gain,
     Verdict,
     _crowding,
     _gains,
@@ -153,8 +154,6 @@ def test_missing_velocities_are_interpolated():
     found = SensorVelocities.of(scans, speeds, times_s)
     assert_array_equal(found.found, [True, True, False, True, True, True])
     assert_allclose(found.mean_mps[2], [7, 0, 1], atol=1e-3)  # a third of the way
-    assert_array_equal(found.static[0], ~np.isin(np.arange(60), [4, 5, 6, 7]))
-    assert found.static[2].all()
     # Changes of 1, 3 and 1 m/s in 1, 3 and 1 s; the gap of 10 s is excluded.
     assert_allclose(found.change, [11 / 5, 0, 0] + np.full(3, 0.02**2), atol=1e-3)
     own = found.covariance[found.found].mean(axis=0)
@@ -225,6 +224,7 @@ def test_a_gain_is_significant_by_students_t():
     assert not Verdict(0.00099, 0.0, 9).improved
     assert not Verdict(0.1, 0.0, 9, crowding=0.2).improved
     assert Verdict.by_groups(gains[:2], groups[:2]).needed == np.inf
+    assert Gain.over(gains[:1], gains[None, 1:2]).significance[0] == 0  # a single pair is no evidence
     assert Verdict(0.5, 0.0, 2).improved
     assert "by +50.00%, by chance and overlap alone up to 0.10%" in Verdict(0.5, 0.0, 2).words
 
@@ -234,14 +234,14 @@ def test_standard_deviations_of_poses_become_settings_of_returns():
     assert pose_sigmas(covariance) == pytest.approx((np.sqrt(3), np.sqrt(0.02)))
     poses = np.tile(np.eye(4), (5, 1, 1))
     refined = RefinedPoses(poses, covariance, True, {"verdict": ""})
-    posed = PosedScans.refined(refined, poses)
+    posed = PosedScans.of(refined, poses)
     assert (posed.rows, posed.segments) == (slice(0, 5), 1)
     found = posed.config(FitConfig()).returns
     assert (found.pose_sigma_m, found.pose_sigma_rad) == pytest.approx((np.sqrt(3), np.sqrt(0.02)))
     for name in ("pose_sigma_m", "pose_sigma_rad"):
         stated = FitConfig(returns={name: 0.3})
         assert posed.config(stated) == stated
-    assert PosedScans.refined(dataclasses.replace(refined, improved=False), poses).sigmas is None
+    assert PosedScans.of(dataclasses.replace(refined, improved=False), poses).sigmas is None
     assert dataclasses.replace(posed, sigmas=(0.1, 7.0)).config(FitConfig()).returns.pose_sigma_rad == 1.0
 
 

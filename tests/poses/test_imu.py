@@ -82,7 +82,7 @@ def test_without_noise_it_is_exact(ride, monkeypatch, late_s):
     seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds_at(times_s))
     imu = measured_imu(poses, times_s, R_sensor_imu=R_SENSOR_IMU, lever_m=LEVER_M)
     found = Inertial.of(imu, velocities_of(seen, 1e-6 * np.eye(3)), times_s + late_s, 0.0)
-    report = found.report
+    report = found.alignment.report
     assert angle(np.array(report["R_sensor_imu"]), R_SENSOR_IMU) < 1e-2
     assert report["time_offset_s"] == pytest.approx(late_s, abs=1e-4)
     np.testing.assert_allclose(report["lever_m"], LEVER_M, atol=1e-3)

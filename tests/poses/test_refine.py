@@ -194,14 +194,6 @@ def test_zero_doppler_does_not_contract_true_poses():
     assert "not measured" in found.report["notes"][0] or "no motion" in found.report["notes"][0]
 
 
-def test_doppler_contradicting_given_poses_is_excluded(street):
-    motion = radarsdf.simulate.measured_motion(street)
-    speeds = [0.2 * v for v in motion.doppler_mps]
-    found = radarsdf.refine_poses(street.points, street.poses, doppler_mps=speeds, times_s=motion.times_s)
-    np.testing.assert_array_equal(found.poses, street.poses)
-    assert "poses show 5.00 times" in found.report["notes"][0]
-
-
 def test_covariances_of_kept_poses_span_the_refined_ones(street):
     one = [street.points[i] if i == 10 else points[:9] for i, points in enumerate(street.points)]
     given = drifted(street.poses, 0.05, 0.004, 1)

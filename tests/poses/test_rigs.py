@@ -57,10 +57,7 @@ def turning_body(count=9, turn_rad_s=0.4, speed_mps=10.0, interval_s=0.05):
     measured = []
     for rows in rig.scans_of_radars().values():
         covariance = np.tile(1e-4 * np.eye(3), (len(rows), 1, 1))
-        masks = [np.ones(3, bool)] * len(rows)
-        of_radar = SensorVelocities(
-            velocities[rows], covariance, np.full(3, 1e-4), masks, np.ones(len(rows), bool)
-        )
+        of_radar = SensorVelocities(velocities[rows], covariance, np.full(3, 1e-4), np.ones(len(rows), bool))
         measured.append((rows, of_radar))
     return poses, at_s, BodyVelocities.of_radars(rig, measured, at_s)
 

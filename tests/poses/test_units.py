@@ -54,16 +54,6 @@ def test_speeds_in_other_units_are_excluded(drive, motion):
     assert "Doppler in m/s" in checked.notes[0]
 
 
-def test_speeds_contradicting_returns_are_excluded(drive, motion):
-    """Regression: poses with steps of half the length had a standard deviation of centimetres."""
-    speeds = [0.5 * speeds for speeds in motion.doppler_mps]
-    found = radarsdf.odometry(drive.points, doppler_mps=speeds, times_s=motion.times_s)
-    assert not found.report["doppler"]
-    (note,) = found.report["notes"]
-    assert "the returns show" in note
-    assert position_error_m(aligned(found.poses, drive.poses), drive.poses) < 0.1
-
-
 @pytest.fixture(scope="module")
 def yard():
     return KINDS["yard"](seed=2, frames=24)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from radarsdf.arrays import Bools, Floats, Ints
+from radarsdf.arrays import Floats, Ints
 from radarsdf.checking.recording import Finding, Severity, some_points
 from radarsdf.poses.agreement import LAGS, MIN_RETURNS, Agreement, Gain, choose_pairs, pairs_apart, relative
-from radarsdf.poses.rigid import assembled, turned_by
+from radarsdf.poses.rigid import assembled
 from radarsdf.scans import Scans
 
 # Minimum gain of a note, as the mean logarithm of distances and in standard errors. The gain over standing still must
@@ -63,7 +64,7 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     if len(pairs) < _MIN_PAIRS:
         return
     agreement = Agreement(recording.points, effort.returns, effort.queries)
-    guesses = hypotheses(poses, pairs, all_axes=effort.all_axes)
+    guesses = list(hypotheses(poses, pairs, all_axes=effort.all_axes))
     motions = relative(poses, pairs)
     others = [guess.T_j_i for guess in guesses]
     scores = agreement.scores(pairs, np.stack([motions, *others, relative(poses, pairs[:, ::-1])]))
@@ -130,46 +131,36 @@ def _best(
     upright = np.array([guess.up for guess in guesses]) @ skewness > _UPSIDE_DOWN
     # Neighbours first: scans far apart observe different things, and agree best where a wrong motion makes their fields
     # of view overlap. Hypotheses clearly worse for neighbours are not tried on scans farther apart.
-    noted = None
+    noted, kinds = None, np.array([guess.finding for guess in guesses])
     for lag in np.unique(lags):
         used = lags <= lag
         if used.sum() < _MIN_PAIRS:
             continue
-        best = _best_of(guesses, scores[:, used], possible, upright)
-        if best is not None and _severity(best[1], best[0].finding) == "error":
-            return best
-        noted = noted or best
-        comparison = Gain.over(scores[0, used], scores[1:, used])
-        possible &= (comparison.mean > -_MIN_GAIN) | (comparison.significance > -_MIN_SIGNIFICANCE)
+        others = scores[1:, used]
+        gain = Gain.over(scores[0, used], others)
+        good = (gain.mean >= _MIN_GAIN) & (gain.significance >= _MIN_SIGNIFICANCE) & possible
+        # Returns come closer to each other, too, if the fields of view of two scans merely overlap more, most of all if the
+        # sensor stands still. A hypothesis that explains the scans better than the data as they are also beats
+        # that one. Measured: without this, 37 of 70 good recordings of 4 to 8 sparse scans had an error; with it, none of 258.
+        beats_still = Gain.over(others[STILL], others).mean >= _MIN_GAIN
+        beats_still[STILL] = True
+        good &= beats_still
+        if good.any():
+            top = int(np.argmax(np.where(good, gain.mean, -np.inf)))
+            near = good & (gain.mean >= _EQUAL * gain.mean[top])
+            near &= (Gain.over(others, others[top]).significance < _NOT_BEHIND) | (
+                np.arange(len(guesses)) == top
+            )
+            # Scans that move on a plane agree equally well upside down.
+            near = near & upright if (near & upright).any() else near
+            # The most common of the mistakes with about equal gains; of its variants, the best one.
+            of_kind = near & (kinds == kinds[np.argmax(near)])
+            k = int(np.argmax(np.where(of_kind, gain.mean, -np.inf)))
+            noted = noted or (guesses[k], float(gain.mean[k]), float(gain.significance[k]))
+            if _severity(float(gain.mean[k]), guesses[k].finding) == "error":
+                return guesses[k], float(gain.mean[k]), float(gain.significance[k])
+        possible &= (gain.mean > -_MIN_GAIN) | (gain.significance > -_MIN_SIGNIFICANCE)
     return noted
-
-
-def _best_of(
-    guesses: list[Hypothesis], scores: Floats, possible: Bools, upright: Bools
-) -> tuple[Hypothesis, float, float] | None:
-    """:func:`_best` for pairs of scans at similar lags."""
-    comparison = Gain.over(scores[0], scores[1:])
-    good = (comparison.mean >= _MIN_GAIN) & (comparison.significance >= _MIN_SIGNIFICANCE) & possible
-    # Returns come closer to each other, too, if the fields of view of two scans merely overlap more, most of all if the
-    # sensor stands still. A hypothesis that explains the scans better than the data as they are also beats
-    # that one. Measured: without this, 37 of 70 good recordings of 4 to 8 sparse scans had an error; with it, none of 258.
-    beats_still = Gain.over(scores[1 + STILL], scores[1:]).mean >= _MIN_GAIN
-    beats_still[STILL] = True
-    good &= beats_still
-    if not good.any():
-        return None
-    top = int(np.argmax(np.where(good, comparison.mean, -np.inf)))
-    kinds = [guess.finding for guess in guesses]
-    behind = Gain.over(scores[1:], scores[1 + top])
-    near = good & (comparison.mean >= _EQUAL * comparison.mean[top])
-    near &= (behind.significance < _NOT_BEHIND) | (np.arange(len(guesses)) == top)
-    # Scans that move on a plane agree equally well upside down.
-    near = near & upright if (near & upright).any() else near
-    # The most common of the mistakes with about equal gains; of its variants, the best one.
-    kind = kinds[int(np.argmax(near))]
-    of_kind = near & np.array([name == kind for name in kinds])
-    chosen = int(np.argmax(np.where(of_kind, comparison.mean, -np.inf)))
-    return guesses[chosen], float(comparison.mean[chosen]), float(comparison.significance[chosen])
 
 
 def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
@@ -187,7 +178,8 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
     both = [
         [(x, x / np.maximum(np.linalg.norm(x, axis=1), 1e-12)[:, None]) for x in of] for of in (given, moved)
     ]
-    for k, middle in enumerate((np.median, np.mean)):
+    middles: tuple[Any, ...] = (np.median, np.mean)
+    for k, middle in enumerate(middles):
         before, after = (np.array([middle(scan[k], axis=0) for scan in scans]) for scans in both)
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
@@ -213,74 +205,47 @@ class Hypothesis:
     finding: str  # name of the finding if the hypothesis is right
     what: str  # completes "the scans agree better if"
     T_j_i: Floats  # (P, 4, 4) motions between the frames of the original points of scan pairs
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # vertical axis in the frame of the original points
+    up: tuple[float, ...] = (0.0, 0.0, 1.0)  # vertical axis in the frame of the original points
 
 
-def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) -> list[Hypothesis]:
-    """Hypotheses about rigid poses (F, 4, 4) for pairs (P, 2) of scans i and j, the more common mistakes first.
+def hypotheses(poses: Floats, pairs: Ints, *, all_axes: bool = True) -> Iterator[Hypothesis]:
+    """Yield hypotheses about rigid poses (F, 4, 4) for pairs (P, 2) of scans i and j, the more common mistakes first.
 
     `all_axes`: whether to try all 47 permutations and reflections of axes, of points and positions, or the eight most common.
     """
-    poses, motions = T_world_sensor, relative(T_world_sensor, pairs)
-
-    def positions(values: Floats) -> Floats:
-        return relative(assembled(poses[:, :3, :3], values), pairs)
-
-    def rotations(values: Rotation) -> Floats:
-        return relative(assembled(values.as_matrix(), poses[:, :3, 3]), pairs)
-
+    motions, R, t = relative(poses, pairs), poses[:, :3, :3], poses[:, :3, 3]
+    yield Hypothesis(
+        "poses_inverted", "the poses are inverted", relative(np.linalg.inv(poses).astype(np.float64), pairs)
+    )
     still = np.tile(np.eye(4), (len(pairs), 1, 1))
-    found = [
-        Hypothesis(
-            "poses_inverted",
-            "the poses are inverted",
-            relative(np.asarray(np.linalg.inv(poses), np.float64), pairs),
-        ),
-        Hypothesis("points_in_world_frame", "the points are in the world frame already", still),
-    ]
+    yield Hypothesis("points_in_world_frame", "the points are in the world frame already", still)
     rotations_by_90 = Rotation.create_group("O").as_matrix().round()
     # All permutations and reflections of axes but the identity.
     for matrix in sorted([*rotations_by_90, *-rotations_by_90], key=_surprise)[1:]:
-        words = _written(matrix)
+        axes = np.argmax(np.abs(matrix), axis=1)
+        words = ", ".join("-" * int(row[k] < 0) + "xyz"[k] for row, k in zip(matrix, axes, strict=True))
         mirrored = np.array_equal(np.abs(matrix), np.eye(3)) and np.linalg.det(matrix) < 0
         camera = any(np.array_equal(matrix, m) for m in (_CAMERA_OF_RADAR, _CAMERA_OF_RADAR.T))
         kind = "camera_frame" if camera else "mirrored" if mirrored else "axes_swapped"
         # z up or down, x and y in any order; and the camera frame
         if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
             continue
-        turned = assembled(matrix)
-        up = float(matrix[2, 0]), float(matrix[2, 1]), float(matrix[2, 2])
-        what = f"the points are read as ({words})"
-        found.append(Hypothesis(kind, what, turned.T @ motions @ turned, up))
+        turned, up = assembled(matrix), tuple(matrix[2].tolist())
+        yield Hypothesis(kind, f"the points are read as ({words})", turned.T @ motions @ turned, up)
         if all_axes or not camera:
             what = f"the positions of the poses are read as ({words})"
-            found.append(Hypothesis(kind, what, positions(poses[:, :3, 3] @ matrix.T)))
+            yield Hypothesis(kind, what, relative(assembled(R, t @ matrix.T), pairs))
     for factor, word in _UNITS.items():
         what = f"the positions of the poses are multiplied by {word}"
-        found.append(Hypothesis("units", what, positions(poses[:, :3, 3] * factor)))
-    for what, angles in _angles(poses):
-        found.append(Hypothesis("angles_in_degrees", what, rotations(angles)))
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    for shift, order, other in ((-1, "w x y z", "x y z w"), (1, "x y z w", "w x y z")):
-        what = f"the quaternions of the poses are {order}, and were read as {other}"
-        rolled = Rotation.from_quat(np.roll(quaternions, shift, axis=1))
-        found.append(Hypothesis("quaternion_order", what, rotations(rolled)))
+        yield Hypothesis("units", what, relative(assembled(R, t * factor), pairs))
+    for name, what, rotations in _rotations(Rotation.from_matrix(R)):
+        yield Hypothesis(name, what, relative(assembled(rotations.as_matrix(), t), pairs))
     for name, (axis, turns) in _TURNS_DEG.items():
         for degrees in (sign * turn for turn in turns for sign in (1, -1)):
             T_vehicle_sensor = assembled(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
             what = f"the sensor is rotated by {degrees} degrees in {name} against the frame of the poses"
-            moved = T_vehicle_sensor.T @ motions @ T_vehicle_sensor
-            found.append(Hypothesis("sensor_turned", what, moved))
-    found.append(
-        Hypothesis("scans_exchanged", "the order of the scans is reversed", relative(poses[::-1], pairs))
-    )
-    return found
-
-
-def _written(matrix: Floats) -> str:
-    """Format a signed permutation as a user would write it: x, -y, -z."""
-    axes = np.argmax(np.abs(matrix), axis=1)
-    return ", ".join("-" * int(row[axis] < 0) + "xyz"[axis] for row, axis in zip(matrix, axes, strict=True))
+            yield Hypothesis("sensor_turned", what, T_vehicle_sensor.T @ motions @ T_vehicle_sensor)
+    yield Hypothesis("scans_exchanged", "the order of the scans is reversed", relative(poses[::-1], pairs))
 
 
 def _surprise(matrix: Floats) -> tuple[bool, bool, float]:
@@ -289,18 +254,20 @@ def _surprise(matrix: Floats) -> tuple[bool, bool, float]:
     return not np.array_equal(matrix, np.eye(3)), *key
 
 
-def _angles(poses: Floats) -> Iterator[tuple[str, Rotation]]:
-    """Rotations (F,) as if their angles were in another unit, with a description."""
-    rotations = Rotation.from_matrix(poses[:, :3, :3])
+def _rotations(given: Rotation) -> Iterator[tuple[str, str, Rotation]]:
+    """Yield rotations (F,) as if their angles were in another unit, or their quaternions in another order."""
     # Angles in rad taken for degrees are 57 times too small.
-    vectors = np.degrees(rotations.as_rotvec())
+    vectors = np.degrees(given.as_rotvec())
     if np.linalg.norm(vectors, axis=1).max() < 2 * np.pi:
-        yield "the angles of the poses are taken for rad, not degrees", Rotation.from_rotvec(vectors)
-    if len(rotations) < 3 or np.median(turned_by(poses[:-1], poses[1:])) < _FAST_RAD:
-        return
-    # Angles in degrees taken for rad lost whole turns. Steps are small, so the turns between scans are known.
-    angles = np.radians(np.unwrap(rotations.as_euler("ZYX"), axis=0))
-    for turns in range(-_LOST_TURNS, _LOST_TURNS + 1):
-        lost = np.array([turns * np.radians(2 * np.pi), 0.0, 0.0])
-        what = "the angles of the poses are taken for degrees, not rad"
-        yield what, Rotation.from_euler("ZYX", angles + lost)
+        what = "the angles of the poses are taken for rad, not degrees"
+        yield "angles_in_degrees", what, Rotation.from_rotvec(vectors)
+    if len(given) >= 3 and np.median((given[:-1].inv() * given[1:]).magnitude()) >= _FAST_RAD:
+        # Angles in degrees taken for rad lost whole turns. Steps are small, so the turns between scans are known.
+        angles = np.radians(np.unwrap(given.as_euler("ZYX"), axis=0))
+        for turns in range(-_LOST_TURNS, _LOST_TURNS + 1):
+            lost = np.array([turns * np.radians(2 * np.pi), 0.0, 0.0])
+            what = "the angles of the poses are taken for degrees, not rad"
+            yield "angles_in_degrees", what, Rotation.from_euler("ZYX", angles + lost)
+    for shift, order, other in ((-1, "w x y z", "x y z w"), (1, "x y z w", "w x y z")):
+        what = f"the quaternions of the poses are {order}, and were read as {other}"
+        yield "quaternion_order", what, Rotation.from_quat(np.roll(given.as_quat(), shift, axis=1))

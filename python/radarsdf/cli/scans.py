@@ -108,7 +108,7 @@ def posed_scans(
     if unposed:
         found = radarsdf.odometry(scans, config=config)
         results.add(found.report["verdict"], poses=found.report)
-        posed, scans = PosedScans.found(found), scans.with_poses(found.poses, other_world=True)
+        posed, scans = PosedScans.of(found), scans.with_poses(found.poses, other_world=True)
         for note in posed.notes:
             warn(f"note: {note}")
         if posed.segments > 1:
@@ -126,7 +126,7 @@ def posed_scans(
         moved = f"{report['moved_m']:.3f} m and {moved_deg:.2f} degrees (RMS)"
         error = f"{report['sigma_m']:.3f} m and {sigma_deg:.2f} degrees"
         results.add(f"they moved by {moved}; the input's step error is {error}")
-    return scans.with_poses(refined.poses), PosedScans.refined(refined, scans.poses)
+    return scans.with_poses(refined.poses), PosedScans.of(refined, scans.poses)
 
 
 def calibrate(given: Namespace, results: Results) -> None:

@@ -26,7 +26,7 @@ from radarsdf.poses.doppler import (
     upright,
 )
 from radarsdf.poses.motion import MotionRate, PredictedStep
-from radarsdf.poses.planes import plane_cell_m
+from radarsdf.poses.planes import Tracked, plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.search import Lost
 from radarsdf.poses.tracking import (
@@ -35,7 +35,6 @@ from radarsdf.poses.tracking import (
     TURNS,
     WINDOW,
     Drive,
-    Tracked,
     Tracker,
     begin_segment,
     rates_of,
@@ -346,9 +345,8 @@ class Follower:
         change = MOVES.change
         if len(known) > 1:
             change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (times_s[-1] - times_s[0])
-        static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
-        velocities = _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
+        velocities = _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, found), sign)
         if (rig := _rig_of(steps)) is None:
             return velocities
         measured = np.array([step.velocity is not None for step in steps])

@@ -98,10 +98,9 @@ class Gain:
 
 
 class _Indexed:
-    """Scan with the k-d tree of at most `returns` returns, and at least `queries` to look up in others, at equal steps."""
+    """Scan with the k-d tree of each n-th of its returns, and of those to look up in others, by two steps."""
 
-    def __init__(self, scan: Array, returns: int, queries: int) -> None:
-        steps = -(-len(scan) // returns), max(1, len(scan) // queries)
+    def __init__(self, scan: Array, steps: tuple[int, int]) -> None:
         self._kept, self.queries = (np.asarray(scan[::step], np.float64) for step in steps)
         self.tree = cKDTree(self._kept)
 
@@ -119,10 +118,13 @@ class _Indexed:
 
 
 class Agreement:
-    """Agreement of scans (N_i, 3): at least `queries` returns of each are looked up among at most `returns` of another one."""
+    """Agreement of scans (N_i, 3): about `queries` returns of each are looked up among at most `returns` of another one.
 
-    def __init__(self, scans: Sequence[Array], returns: int, queries: int) -> None:
-        self._scans, self._returns, self._queries = scans, returns, queries
+    They are sampled at equal steps, not at random. `at_least`: whether `queries` is a minimum, else a maximum.
+    """
+
+    def __init__(self, scans: Sequence[Array], returns: int, queries: int, *, at_least: bool = False) -> None:
+        self._scans, self._returns, self._queries, self._at_least = scans, returns, queries, at_least
         self._indexed: dict[int, _Indexed] = {}
 
     def scores(self, pairs: Ints, T_j_i: Floats) -> Floats:
@@ -159,7 +161,9 @@ class Agreement:
 
     def _of(self, i: int) -> _Indexed:
         if i not in self._indexed:
-            self._indexed[i] = _Indexed(self._scans[i], self._returns, self._queries)
+            count = len(self._scans[i])
+            step = max(1, count // self._queries) if self._at_least else -(-count // self._queries)
+            self._indexed[i] = _Indexed(self._scans[i], (-(-count // self._returns), step))
         return self._indexed[i]
 
 
@@ -194,8 +198,8 @@ def relative(T_world_sensor: Floats, pairs: Ints) -> Floats:
 
 
 def of_neighbours(scans: Sequence[Floats], queries: int = _SAMPLED) -> Agreement:
-    """Compare `queries` returns of each scan with all of others."""
-    return Agreement(scans, max(map(len, scans)), queries)
+    """Compare at least `queries` returns of each scan with all of others."""
+    return Agreement(scans, max(map(len, scans)), queries, at_least=True)
 
 
 def sign_significance(

@@ -367,11 +367,11 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     if rig is None or len(np.unique(rig.of_scan)) < 2:
         msg = "calibrate needs scans of several radars: Scans(..., sensors=labels)"
         raise ValueError(msg)
-    if scans.times_s is None:
+    if (times_s := scans.times_s) is None:
         msg = "times_s are missing: the time of each scan, s"
         raise ValueError(msg)
-    order = np.argsort(scans.times_s, kind="stable")
-    scans, rig, times_s = scans.select(order), rig.select(order), scans.times_s[order]
+    order = np.argsort(times_s, kind="stable")
+    scans, rig, times_s = scans.select(order), rig.select(order), times_s[order]
     labels, reference, mountings = rig.labels, int(rig.of_scan[0]), rig.T_body_sensor
     if mountings is None:
         mountings = np.tile(np.eye(4), (len(labels), 1, 1))

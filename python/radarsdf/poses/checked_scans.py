@@ -82,11 +82,12 @@ class CheckedScans:
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
         if offset_mps := radial_offset_mps(scans, speeds, velocities):
-            why = f"{offset_mps:.2f} m/s are added to that of all returns"
-            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
-        moving = sum(int((~static).sum()) for static in velocities.static)
-        standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
-        return cls(rows, standing, times_s, begin_s, velocities, moving, notes)
+            offset = f"{offset_mps:.2f} m/s are added to that of all returns"
+            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {offset}."])
+        each = zip(scans, speeds, velocities.of_scans, strict=True)
+        static = [x[one.static | np.isnan(mps)] if one.found else x for x, mps, one in each]
+        moving = sum(map(len, scans)) - sum(map(len, static))
+        return cls(rows, static, times_s, begin_s, velocities, moving, notes)
 
     @classmethod
     def of_radars(

@@ -141,7 +141,7 @@ class Clock:
 
 def delay_of(
     velocities: SensorVelocities,
-    runs: Ints,  # of scans without a gap
+    runs: Ints,
     rows: Ints,
     motion: DopplerMotion,
     shown: Floats,
@@ -151,7 +151,7 @@ def delay_of(
 ) -> tuple[int, tuple[int, ...]]:
     """Return the delay, scans, of the Doppler with which steps (K, 3) by another source agree best, if significantly; else 0.
 
-    And those that are not excluded. `velocities` and `runs`: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of
+    And those that are not excluded. `velocities` and `runs` without a gap: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of
     `shown`; `seen` (K, 3): the shares of its differences from `motion` that it shows, since it has a prior from this motion.
     """
     # The steps by delayed Doppler explain the residuals of those by its own (J test, Davidson and MacKinnon 1981).
@@ -335,10 +335,9 @@ class Consistency:
         if self.doubts is None:
             velocities = dataclasses.replace(velocities, common_sigma=_UNKNOWN_SCALE)
             return velocities, ["Assumed: the Doppler is in m/s; too few scans with motion decide its scale."]
-        if not self.doubts:
-            return velocities, []
         scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
-        return velocities, [f"Assumed: the Doppler is right; scans {scans} do not decide its scale."]
+        note = f"Assumed: the Doppler is right; scans {scans} do not decide its scale."
+        return velocities, [note] if self.doubts else []
 
     def corrected(self, checked: CheckedScans) -> CheckedScans:
         """Return scans with the velocities and times to use, and notes."""
@@ -374,8 +373,7 @@ class _Pairs:
 
         `yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
         """
-        scales, agreement = len(_SCALES), of_neighbours(scans, _SAMPLED)
-        gains, losses, moved = [], [], []
+        scales, agreement, apart = len(_SCALES), of_neighbours(scans, _SAMPLED), []
         for i in rows.tolist():
             step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
             shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])
@@ -383,14 +381,11 @@ class _Pairs:
             if yaws is not None and np.isfinite(yaws[i]):
                 turns.append(rotation(np.array([0.0, 0.0, yaws[i]])))
             both = [assembled(np.tile(turn, (len(shifts_m), 1, 1)), shifts_m) for turn in turns]
-            logs = [agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both]
-            apart = np.min(logs, axis=0)
-            ahead, back, still, shifted = np.split(apart, [scales, 2 * scales, 2 * scales + 1])
-            gains.append(back - ahead)
-            losses.append(shifted - still)
-            moved.append(still[0] - ahead[_SAME])
+            apart.append(np.min([agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both], axis=0))
+        ends = [scales, 2 * scales, 2 * scales + 1]
+        ahead, back, still, shifted = np.split(np.array(apart), ends, axis=1)
         slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
-        return cls(np.array(gains), np.array(losses), np.array(moved), along[rows], slow)
+        return cls(back - ahead, shifted - still, still[:, 0] - ahead[:, _SAME], along[rows], slow)
 
     def select(self, rows: slice | Bools) -> _Pairs:
         return _Pairs(*(column[rows] for column in vars(self).values()))
@@ -462,8 +457,8 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             found += [(True, *other) for other in moving.others(level)]
             if abs(moving.farthest - 1) > _MEASURED:
                 doubts.append(OtherMotion(first, last, moving.farthest, confirmed=False))
-        for confirmed, excess, ratio in found:
-            if excess > 1:
-                contradictions.append((confirmed, excess, OtherMotion(first, last, ratio, confirmed)))
+        contradictions += [
+            (c, excess, OtherMotion(first, last, r, c)) for c, excess, r in found if excess > 1
+        ]
     clearest = max(contradictions, key=lambda one: one[:2])[2] if contradictions else None
     return clearest, tuple(doubts)

@@ -47,7 +47,6 @@ class SensorVelocities:
     mean_mps: Floats  # (F, 3)
     covariance: Floats  # (F, 3, 3), m²/s²
     change: Floats  # (3,) spectral density of the acceleration by component (random walk), m²/s³
-    static: list[Bools]  # F masks (N_i,) of the returns that agree with the velocity
     found: Bools  # (F,) whether the returns agree on a velocity. Else it is interpolated
     # Standard deviation of the systematic error of all velocities in any direction, share of the speed.
     common_sigma: float = _IN_COMMON
@@ -69,10 +68,6 @@ class SensorVelocities:
         means = np.stack([velocity.velocity_mps for velocity in each])
         covariance = np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3)
         mean, covariance, weak = upright(means, covariance)
-        static = [
-            velocity.static | np.isnan(speeds) if velocity.found else np.ones(len(scan), bool)
-            for velocity, scan, speeds in zip(each, scans, doppler_mps, strict=True)
-        ]
         at = times_s[found]
         durations = np.diff(at)
         usual = (durations > 0) & (durations <= 2 * np.median(durations))
@@ -83,12 +78,11 @@ class SensorVelocities:
             mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
             away_s = np.abs(at - times_s[i]).min()
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
-        return cls(mean, covariance, change, static, found, climb_assumed=weak, of_scans=each)
+        return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each)
 
     def select(self, rows: slice | Ints) -> Self:
-        static = [self.static[i] for i in np.arange(len(self.static))[rows]]
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
-        return dataclasses.replace(self, static=static, of_scans=(), **columns)
+        return dataclasses.replace(self, of_scans=(), **columns)
 
     @property
     def usual_mps(self) -> float:
@@ -129,11 +123,9 @@ def radial_offset_mps(
     offsets, variances = [], []
     if folding_interval_mps(doppler_mps) is not None:
         return 0.0  # aliased speeds hide it
-    for scan, speeds, static, found in zip(
-        scans, doppler_mps, velocities.static, velocities.found, strict=True
-    ):
-        used = static & np.isfinite(speeds) & scan.any(axis=1)
-        if not found or used.sum() <= 2 * MIN_DOPPLER_RETURNS:
+    for scan, speeds, velocity in zip(scans, doppler_mps, velocities.of_scans, strict=True):
+        used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
+        if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
             continue
         away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
         columns = np.column_stack([-away, np.ones(len(away))])
@@ -255,7 +247,6 @@ class BodyVelocities(SensorVelocities):
             mean,
             covariance,
             np.min(changes, axis=0),  # they include the noise of each radar
-            [np.zeros(0, bool)] * count,  # moving returns were left out before
             np.ones(count, bool),
             common_sigma=max(velocities.common_sigma for _, velocities in measured),
             clock_sigma_s=max(velocities.clock_sigma_s for _, velocities in measured),

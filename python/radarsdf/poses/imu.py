@@ -106,7 +106,16 @@ class Gyroscope:
         covariance = np.stack([motion.covariance for motion in motions])
         off = self.turns[rows] - turns
         weights = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3)).astype(np.float64)
-        _check_agreement(off, turns, durations_s, weights, covariance)
+        bias, _, square = _fit_bias(off, durations_s, weights)
+        constant, rate = _fit_bias(-turns, durations_s, weights)[2], float(np.linalg.norm(bias))
+        contradicted = len(off) > _LEAST_STEPS and square > max(_CONTRADICTED, _CONTRADICTED_SHARE * constant)
+        # Turns that the returns hardly observe share the error of their prediction.
+        unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
+        if contradicted or rate >= _MOST_BIAS_RAD_S + 3 * unknown:
+            off_by = f"{np.sqrt(square / 3):.1f} standard deviations and a bias of {rate:.2f} rad/s"
+            what = f"its rates differ from the turns that the returns show by {off_by}"
+            msg = f"{what}: are they in rad/s, and in the axes of the radar?"
+            raise UnusableGyroscopeError(msg)
         prior = np.linalg.inv(self.bias.covariance).astype(np.float64)
         bias, information, _ = _fit_bias(off, durations_s, weights, prior)
         squares = (off - bias * durations_s[:, None]) ** 2 - np.einsum("fii->fi", covariance)
@@ -123,23 +132,6 @@ def _fit_bias(
     bias: Floats = np.linalg.solve(information, np.einsum("fij,fj,f->i", weights, off, durations_s))
     left = off - bias * durations_s[:, None]
     return bias, information, float(np.einsum("fi,fij,fj->f", left, weights, left).mean())
-
-
-def _check_agreement(
-    off: Floats, turns: Floats, durations_s: Floats, weights: Floats, covariance: Floats
-) -> None:
-    """Raise an UnusableGyroscopeError if the residual rotations `off` (K, 3) are too large or biased."""
-    bias, _, square = _fit_bias(off, durations_s, weights)
-    constant = _fit_bias(-turns, durations_s, weights)[2]
-    rate = float(np.linalg.norm(bias))
-    contradicted = len(off) > _LEAST_STEPS and square > max(_CONTRADICTED, _CONTRADICTED_SHARE * constant)
-    # Turns that the returns hardly observe share the error of their prediction.
-    unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
-    if contradicted or rate >= _MOST_BIAS_RAD_S + 3 * unknown:
-        off_by = f"{np.sqrt(square / 3):.1f} standard deviations and a bias of {rate:.2f} rad/s"
-        what = f"its rates differ from the turns that the returns show by {off_by}"
-        msg = f"{what}: are they in rad/s, and in the axes of the radar?"
-        raise UnusableGyroscopeError(msg)
 
 
 # Minimum length of a window: longer ones gave the same rotation for the real walk, to 0.5 degrees.

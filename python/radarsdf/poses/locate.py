@@ -16,11 +16,11 @@ from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.map import Map
 from radarsdf.poses.odometry import track_scans
-from radarsdf.poses.planes import PlaneMap, SensorReturns, least_certain, plane_cell_m, thin
+from radarsdf.poses.planes import PlaneMap, SensorReturns, Tracked, least_certain, plane_cell_m, thin
 from radarsdf.poses.refine import WEAK, PosesEstimate
 from radarsdf.poses.rigid import covariance_in, increments, skew, transform
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near, search_scans
-from radarsdf.poses.tracking import Drive, Tracked
+from radarsdf.poses.tracking import Drive
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.rig import Imu

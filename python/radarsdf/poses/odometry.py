@@ -20,10 +20,10 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import NOT_USED, BodyVelocities
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
-from radarsdf.poses.planes import SensorReturns, plane_cell_m
+from radarsdf.poses.planes import SensorReturns, Tracked, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate, RefinedPoses
 from radarsdf.poses.rigid import lengths_of_steps_m, steps
-from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, Tracked, track_drive
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.rig import Imu
 from radarsdf.scans import Scans
@@ -251,12 +251,11 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
 
     moved, turned = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
     removed = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
-    doppler = "their Doppler (doppler_mps)"
+    unsure = any(note.startswith(NOT_USED) for note in notes)
+    doppler = "Doppler that most returns of a scan agree on" if unsure else "their Doppler (doppler_mps)"
     # Minimum share of the prior variance of a step's rotation that the returns must remove: over the window of scans, it adds up
     # to all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
     least_turned = 1 / drive.window
-    if any(note.startswith(NOT_USED) for note in notes):
-        doppler = "Doppler that most returns of a scan agree on"
     if drive.velocities is None and moved < LEAST_OBSERVED:
         refuse("moved", removed.format(moved, LEAST_OBSERVED), doppler)
     durations_s, velocities = np.diff(drive.times_s), drive.velocities
@@ -271,12 +270,10 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
         if (significance := motion_significance(drive.scans, within, motions)) < -ERRORS:
             refuse("moved", "scans agree better without any motion", doppler)
         if significance < ERRORS:
-            what = "neighbouring scans agree as well without any motion"
-            assumed.append(f"Assumed: the sensor moved as estimated; {what}.")
+            assumed.append("Assumed: the sensor moved as estimated; scans agree as well without any motion.")
     if unknown:
-        why = f"as {LATERAL_MPS2:.0f} m/s² across its trajectory make of its speed"
-        what = f"the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, {why}"
-        assumed.append(f"Assumed: {what}; the returns of a scan hardly measure it.")
+        rate = f"{drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its trajectory make of its speed"
+        assumed.append(f"Assumed: the sensor turns by about {rate}; the returns of a scan hardly measure it.")
     return assumed
 
 
@@ -344,19 +341,15 @@ class PosedScans:
     notes: tuple[str, ...] = ()  # sentences on unused input
 
     @classmethod
-    def refined(cls, refined: RefinedPoses, given: Floats) -> PosedScans:
-        """Build from refined poses and the original ones (F, 4, 4). `sigmas` are unknown if these were kept."""
-        sigmas = pose_sigmas(refined.covariance) if refined.improved else None
-        rows, notes = slice(0, len(given)), tuple(refined.report.get("notes", ()))
-        return cls(refined.poses, rows, given, 1, trajectory_report(refined, given), sigmas, notes)
-
-    @classmethod
-    def found(cls, found: Odometry) -> PosedScans:
-        """Build from the longest segment of odometry."""
-        rows, report = found.longest_segment(), found.report
-        sigmas, trajectory = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
-        segments, notes = report["segments"], tuple(report["notes"])
-        return cls(found.poses[rows], rows, None, segments, trajectory, sigmas, notes)
+    def of(cls, found: RefinedPoses | Odometry, given: Floats | None = None) -> PosedScans:
+        """Build from the longest segment of odometry, or from refined poses and the original ones (F, 4, 4)."""
+        rows = found.longest_segment() if isinstance(found, Odometry) else slice(0, len(found.poses))
+        kept = isinstance(found, RefinedPoses) and not found.improved
+        sigmas = None if kept else pose_sigmas(found.covariance[rows])
+        segments, notes = found.report.get("segments", 1), tuple(found.report.get("notes", ()))
+        return cls(
+            found.poses[rows], rows, given, segments, trajectory_report(found, given, rows), sigmas, notes
+        )
 
     def config(self, config: FitConfig) -> FitConfig:
         """Return `config` with the errors of the poses, unless it specifies its own."""

@@ -191,19 +191,11 @@ def refine_poses(
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. :class:`radarsdf.io.Scans` supply poses, times
-        and Doppler unless these are passed separately.
+        (N_i, 3) each, with `doppler_mps`, `config` and `progress` as in :func:`odometry`. :class:`radarsdf.io.Scans` supply poses, too.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan; of a rig, T_world_body.
-    doppler_mps : sequence of F arrays, optional
-        (N_i,) each, radial speed, m/s, of either sign, aliased or not; NaN where it was not measured. Moving returns are
-        excluded. Needs `times_s`.
     times_s : (F,) array_like, optional
-        Times of the scans, s. Steps over gaps have larger errors. By default all steps are alike.
-    config : FitConfig, optional
-        Settings, of which ranges, noise, leaf cells and threads are used.
-    progress : bool, optional
-        Whether to show a progress bar. Default: only on a terminal.
+        Times of the scans, s, needed with Doppler. Steps over gaps have larger errors. By default all steps are alike.
 
     Returns
     -------
