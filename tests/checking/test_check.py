@@ -124,7 +124,7 @@ def test_a_drift_below_the_noise_of_a_coarse_sensor_is_not_reported(kind):
 
 @pytest.fixture(scope="module")
 def good():
-    return simulated("wall", 20)
+    return simulated("wall", 14)
 
 
 def differs(a, b):

@@ -22,7 +22,6 @@ FACTORS = {
     "sign from half": np.where(HALF, -1, 1),
     "zero from half": np.where(HALF, 0, 1),
     "1.3 from half": np.where(HALF, 1.3, 1),
-    "1.15": np.full(20, 1.15),
 }
 
 
@@ -34,11 +33,6 @@ def street():
 @pytest.fixture(scope="module")
 def motion(street):
     return measured_motion(street, seed=5)
-
-
-@pytest.fixture(scope="module")
-def tunnel():
-    return KINDS["tunnel"](seed=5, frames=20)
 
 
 @pytest.fixture(autouse=True)
@@ -126,10 +120,11 @@ def test_a_changed_sign_of_a_sensor_that_turns_fast_is_found(factor):
         assert (tested.contradicted.ratio, tested.contradicted.first) == (-1, 9)
 
 
-@pytest.mark.parametrize("fault", ["sign from half", "zero from half"])
-def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(tunnel, fault):
+def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations():
+    tunnel = KINDS["tunnel"](seed=5, frames=20)
     motion = measured_motion(tunnel, seed=5)
-    speeds = [factor * values for factor, values in zip(FACTORS[fault], motion.doppler_mps, strict=True)]
+    factors = FACTORS["sign from half"]
+    speeds = [factor * values for factor, values in zip(factors, motion.doppler_mps, strict=True)]
     found, worst = odometry(tunnel, speeds, motion.times_s)
     assert found.report["notes"]
     assert worst < 4

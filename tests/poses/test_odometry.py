@@ -71,8 +71,8 @@ def test_errors_of_tracked_steps_do_not_persist():
 
 
 def test_damped_rolls_are_not_expected():
-    """A motion prior of tracked rates, which returns hardly measure, left 0.69 degrees."""
-    lap = radarsdf.simulate.oculii(seed=2)
+    """A motion prior of tracked rates, which returns hardly measure, left 0.6 degrees."""
+    lap = first(radarsdf.simulate.oculii, 70, seed=2)
     motion = measured_motion(lap, seed=2)
     found = radarsdf.odometry(lap.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
     assert errors(found.poses, lap.poses)[1] < np.radians(0.5)
@@ -326,10 +326,10 @@ def test_errors_of_a_narrow_radar_are_in_its_covariance(rate_rad_s):
 
 
 def test_a_radar_without_elevation_has_a_prior_of_small_climbs():
-    points, doppler_mps, times_s, true = road(2, elevation_deg=0.0, scans=24)
+    points, doppler_mps, times_s, true = road(2, elevation_deg=0.0, scans=18)
     assert all((scan[:, 2] == 0).all() for scan in points)
     found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
-    assert "24 of 24 scans" in found.report["notes"][0]
+    assert "18 of 18 scans" in found.report["notes"][0]
     assert end_error_m(found, true) < 0.5
     assert np.abs(deviations(found, true)[:, :2]).max() < 4
 

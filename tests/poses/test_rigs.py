@@ -98,7 +98,7 @@ def test_odometry_of_radars_that_measure_at_their_own_times_places_the_body(scan
 
 
 def test_two_radars_at_one_place_are_as_good_as_one_radar(scans):
-    front = scans.select([i for i, label in enumerate(scans.sensors) if label == "front"])
+    front = scans.select([i for i, label in enumerate(scans.sensors) if label == "front"][:12])
     alone = radarsdf.odometry(front.points, doppler_mps=front.doppler_mps, times_s=front.times_s)
     T = front.T_body_sensor["front"]
     alternating = Scans(
@@ -117,6 +117,7 @@ def test_two_radars_at_one_place_are_as_good_as_one_radar(scans):
 def test_an_imu_and_several_radars_place_the_body(drive, scans):
     times_s = FRAME_S * np.arange(len(drive))
     imu = dataclasses.replace(measured_imu(drive.poses, times_s), R_sensor_imu=np.eye(3), specific_force=None)
+    scans = scans.select(range(20))
     found = radarsdf.odometry(scans, imu=imu)
     assert found.report["gyroscope"]
     assert errors(found.poses, scans)[0] < 0.03
