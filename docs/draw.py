@@ -1,7 +1,4 @@
-"""Draws the figures of the pages: ``python docs/draw.py`` writes them to docs/figures.
-
-All but `changes.png` are of one simulated drive and one fit of it. It takes half a minute and needs the extra `plot`.
-"""
+"""Draw the figures of how_it_works.md: ``python docs/draw.py`` writes them to docs/figures. It needs the extra `plot`."""
 
 from __future__ import annotations
 
@@ -12,18 +9,11 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf.changes.changes import APPEARED, COLORS, GONE, MOVED, NAMES, SAME, UNSEEN
 from radarsdf.fitting import sampling
-from radarsdf.render.figures import new_figure, png_of, save_view_picture
-from radarsdf.render.picture import render, save_picture
-from radarsdf.simulate import Box, Scene, simulate
-from radarsdf.simulate.materials import CONCRETE
+from radarsdf.render.figures import new_figure, png_of
 
-HELD_OUT = 3  # the scan that is predicted
+SCAN = 3  # the one that is drawn
 BOX = (10.0, 45.0, -12.0, 12.0)  # part of the street that is drawn from above: x from, to, y from, to, m
-SIZE = {"width": 1200, "height": 560}
-TAKEN, PUT = (2.5, 2.5, 0.5), (2.5, -3.0, 0.5)  # centres of a box that goes and of one that comes, m
-ROUND_BOXES = [[-3.0, -6.0, -0.5], [12.0, 6.0, 3.0]]
 LIGHT, DARK, RED, BLUE = "#b9c2cc", "#2c3e50", "#c0392b", "#1f5a96"
 
 
@@ -46,7 +36,7 @@ def returns(drive: Any, path: Path) -> None:
     scan_of = np.repeat(np.arange(len(drive)), counts)
     world, true = drive.world_points(), drive.is_surface()
     for axes, chosen, title in (
-        (one, scan_of == HELD_OUT, "one scan"),
+        (one, scan_of == SCAN, "one scan"),
         (every, np.full(len(true), True), f"{len(drive)} scans, moved by their poses"),
     ):
         for kind, color, label in ((true, DARK, "from a surface"), (~true, RED, "ghosts and clutter")):
@@ -81,69 +71,14 @@ def samples(config: radarsdf.FitConfig, path: Path) -> None:
     path.write_bytes(png_of(figure, dpi=100))
 
 
-def field(radar_map: radarsdf.RadarMap, height_m: float, path: Path) -> None:
-    """A slice of the signed distance, and the surface in it."""
-    figure = new_figure(figsize=(9, 5.0), layout="constrained")
-    axes = figure.subplots()
-    x, y = np.arange(BOX[0], BOX[1], 0.05), np.arange(BOX[2], BOX[3], 0.05)
-    grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height_m)], -1).reshape(-1, 3)
-    sdf = np.where(radar_map.observed(grid), radar_map.sdf(grid), np.nan).reshape(len(y), len(x))
-    shown = axes.pcolormesh(x, y, sdf, cmap="RdBu", vmin=-0.4, vmax=0.4, rasterized=True)
-    axes.contour(x, y, sdf, [0.0], colors="black", linewidths=1.0)
-    axes.set(
-        title=f"signed distance {height_m:.1f} m above the world's origin",
-        aspect="equal",
-        xlabel="x, m",
-        ylabel="y, m",
-    )
-    figure.colorbar(shown, label="m: blue in free space, red behind", shrink=0.8)
-    path.write_bytes(png_of(figure, dpi=100))
-
-
-def changes(frames: int, path: Path) -> None:
-    """What two drives past a wall tell of two boxes."""
-    first = radarsdf.simulate.wall(frames=frames)
-    beside = first.poses.copy()
-    beside[:, 1, 3] += 0.3
-    maps = []
-    for day, (poses, center) in enumerate(((first.poses, TAKEN), (beside, PUT))):
-        box = Box(np.array(center), np.full(3, 0.5), 0.3, CONCRETE)
-        scene = Scene([*first.scene.solids, box], first.scene.terrain)
-        drive = simulate(scene, first.sensor, poses, name="wall", seed=day)
-        config = radarsdf.FitConfig.quick(returns={"free_space": True})
-        maps.append(radarsdf.fit(drive.points, drive.poses, config=config))
-    mesh = radarsdf.compare(*maps, box=ROUND_BOXES).mesh()
-    figure = new_figure(figsize=(12, 5.6), facecolor="white")
-    figure.figimage(render(mesh, mesh.visual.vertex_colors, **SIZE), 0, 0)
-    for row, kind in enumerate((APPEARED, GONE, MOVED, SAME, UNSEEN)):
-        figure.text(0.02, 0.92 - 0.06 * row, "\u25a0", color=np.array(COLORS[kind]) / 255, size=15)
-        figure.text(0.04, 0.92 - 0.06 * row, NAMES[kind], size=15)
-    path.write_bytes(png_of(figure, dpi=100))
-
-
 def draw(folder: Path, frames: int) -> None:
-    """Write all figures."""
+    """Write both figures."""
     folder.mkdir(parents=True, exist_ok=True)
     drive = radarsdf.simulate.hugin(frames=frames)
-    kept = [i for i in range(len(drive)) if i != HELD_OUT]
-    points, intensities = ([list_[i] for i in kept] for list_ in (drive.points, drive.intensities))
-    radar_map = radarsdf.fit(points, drive.poses[kept], intensities)
-    mesh = radar_map.mesh(0.1, viewpoint=drive.poses[0, :3, 3])
-    answers = mesh.vertex_attributes
-
     returns(drive, folder / "returns.png")
-    samples(radar_map.config, folder / "samples.png")
-    field(radar_map, drive.poses[0, 2, 3], folder / "field.png")
-    save_picture(folder / "surface.png", mesh, **SIZE)
-    save_picture(folder / "reflectance.png", mesh, scalar=answers["intensity"], label="intensity, dB", **SIZE)
-    save_picture(
-        folder / "uncertainty.png", mesh, scalar=answers["uncertainty_m"], label="uncertainty, m", **SIZE
-    )
-    measured = np.column_stack([drive.points[HELD_OUT], drive.intensities[HELD_OUT]])
-    save_view_picture(folder / "view.png", [radar_map.render(drive.poses[HELD_OUT])], [measured])
+    samples(radarsdf.FitConfig(), folder / "samples.png")
     for path in folder.glob("*.png"):
         small(path)
-    changes(min(frames, 24), folder / "changes.png")  # fewer colours would tint its greys
 
 
 if __name__ == "__main__":

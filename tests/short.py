@@ -1,4 +1,4 @@
-"""Short fits and drives for pages and examples, which test text and files, not quality."""
+"""Short fits and drives for pages, which test text and files, not quality."""
 
 from __future__ import annotations
 

@@ -13,14 +13,6 @@ _STEP_S = 0.1
 _FRAMES = 8
 
 
-def write_demo(folder: Path) -> None:
-    """Write the scans of `radarsdf demo`, but fewer."""
-    drive = radarsdf.simulate.hugin(frames=_FRAMES)
-    (folder / "radarsdf_demo").mkdir()
-    scans = radarsdf.io.Scans(drive.points, drive.poses, drive.intensities)
-    radarsdf.io.write_scans(folder / "radarsdf_demo" / "scans.npz", scans)
-
-
 def write_recordings(folder: Path) -> None:
     """Write a drive as a PCD folder, in KITTI format in millimetres, and as a ROS 2 bag, complete and truncated."""
     drive = radarsdf.simulate.hugin(frames=_FRAMES)
