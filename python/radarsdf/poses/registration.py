@@ -123,10 +123,14 @@ def _least_certain(covariance: Floats) -> Floats:
 
 
 def _discount_tilts(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
-    """Return Hessians (..., 6, 6) and gradients (..., 6) without the contribution of errors of the normals."""
+    """Return Hessian (6, 6) and gradient (6,) without the contribution (6, 6) of errors of the normals."""
     # Along a wall, slightly tilted normals would seem to observe the position along it.
-    M = reduction(hessian, doubt)
-    return M @ hessian @ M.swapaxes(-1, -2), np.einsum("...ij,...j->...i", M @ M, gradient)
+    try:
+        np.linalg.cholesky(hessian - doubt)
+    except np.linalg.LinAlgError:
+        M = reduction(hessian, doubt)
+        return M @ hessian @ M.T, M @ M @ gradient
+    return hessian - doubt, gradient - doubt @ np.linalg.solve(hessian, gradient)
 
 
 def _removed_share(prior: Floats, covariance: Floats) -> float:
