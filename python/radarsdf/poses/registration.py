@@ -16,7 +16,8 @@ from radarsdf.poses.rigid import increments, moved
 _CELLS = 4.0, 2.0  # cell edges, coarse to fine, relative to a map's surfels
 # Along the least certain axis, shifted scans of tunnels have 0.6 to 1.2 times the information, those of nine other kinds of scenes
 # 0.02 to 0.19 times.
-_ITERATIONS, _SETTLED = 8, 0.03  # at each cell size: maximum, tolerance in standard deviations
+_ITERATIONS = 8  # maximum at each cell size
+_SETTLED = 0.3, 0.03  # tolerances at these, standard deviations: coarse cells only lead to the fine ones
 _MOST_RETURNS = 2000  # of a scan
 _LEAST_VARIANCE = 1e-12  # of a prior, m² and rad²
 _SHIFTS = 0.0, 1.0, -1.0, 2.0, -2.0  # cells, beyond the extent of single objects
@@ -68,7 +69,7 @@ class PlaneMap:
         """Fit the pose of a scan (N, 3), sensor frame, m, coarse to fine, given that of the prior and its covariance (6, 6)."""
         prior = prior + _LEAST_VARIANCE * np.eye(6)
         information, pose = np.linalg.inv(prior), mean if start is None else start
-        for planes in (self.coarse, self.fine):
+        for planes, settled in zip((self.coarse, self.fine), _SETTLED, strict=True):
             for _ in range(_ITERATIONS):
                 *equations, inliers = planes.agreement(scan, pose, self.variances)
                 hessian, gradient = _discount_tilts(*equations)
@@ -76,7 +77,7 @@ class PlaneMap:
                 off = gradient + information @ increments(mean, pose)
                 step = -np.linalg.solve(total, off).astype(np.float64)
                 pose = moved(pose, step)
-                if step @ total @ step < 6 * _SETTLED**2:
+                if step @ total @ step < 6 * settled**2:
                     break
         covariance = self._discount_chance(scan, pose, prior, np.linalg.inv(total))
         moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
