@@ -178,7 +178,8 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
                                  const ReturnVariances& noise) const {
   const Vec3 up{pose[2], pose[6], pose[10]};
   struct Row {
-    double value, variance, jacobian[3][kPose];  // rows: the normal, then its two tilts
+    Residual residual;
+    Vec3 arm;
   };
   std::vector<Row> rows;
   std::vector<double> squares;
@@ -188,16 +189,8 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
     store(rotate(pose, beam.direction), direction);
     const auto found = residual(arm + translation(pose), direction, beam.range_m, up, noise);
     if (!found) continue;
-    Row row{found->value, found->variance, {}};
-    const Plane& of = *found->plane;
-    for (int k = 0; k < 3; ++k) {
-      const double tilt = k == 0 ? 1 : std::sqrt(of.variances[0] / (of.count * of.variances[k]));
-      const Vec3 axis = tilt * of.axes[k];
-      store(axis, row.jacobian[k]);
-      store(cross(arm, axis), row.jacobian[k] + 3);
-    }
-    rows.push_back(row);
-    squares.push_back(row.value * row.value / row.variance);
+    rows.push_back({*found, arm});
+    squares.push_back(found->value * found->value / found->variance);
   }
   Agreement found;
   if (rows.empty()) return found;
@@ -205,17 +198,20 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
   std::nth_element(squares.begin(), middle, squares.end());
   const double scale = std::max(1.0, *middle / kMedianOfSquare);  // as in CommonPlanes
   for (const Row& row : rows) {
-    const double variance = scale * row.variance;
-    const double share = 1 / (1 + row.value * row.value / (kSigmas2 * variance));
-    const double weight = share * share;
+    const double value = row.residual.value, variance = scale * row.residual.variance;
+    const double share = 1 / (1 + value * value / (kSigmas2 * variance));
+    const double weight = share * share, information = weight / variance;
     found.weight += weight;
-    for (std::size_t a = 0; a < kPose; ++a) {
-      found.gradient[a] += weight / variance * row.value * row.jacobian[0][a];
-      for (std::size_t b = 0; b < kPose; ++b) {
-        found.hessian[kPose * a + b] += weight / variance * row.jacobian[0][a] * row.jacobian[0][b];
-        for (int k = 1; k < 3; ++k) {
-          found.doubt[kPose * a + b] += weight / variance * row.jacobian[k][a] * row.jacobian[k][b];
-        }
+    const Plane& of = *row.residual.plane;
+    for (int k = 0; k < 3; ++k) {  // the normal, then its two tilts
+      double jacobian[kPose];
+      store(of.axes[k], jacobian);
+      store(cross(row.arm, of.axes[k]), jacobian + 3);
+      const double scaled = k == 0 ? information : information * of.variances[0] / (of.count * of.variances[k]);
+      auto& sums = k == 0 ? found.hessian : found.doubt;
+      for (std::size_t a = 0; a < kPose; ++a) {
+        if (k == 0) found.gradient[a] += information * value * jacobian[a];
+        for (std::size_t b = 0; b < kPose; ++b) sums[kPose * a + b] += scaled * jacobian[a] * jacobian[b];
       }
     }
   }

@@ -197,7 +197,8 @@ def planes_of(points: Floats32, surfels: Surfels, num_threads: int) -> Ints32:
 _CELLS = 4.0, 2.0  # cell edges, coarse to fine, relative to a map's surfels
 # Along the least certain axis, shifted scans of tunnels have 0.6 to 1.2 times the information, those of nine other kinds of scenes
 # 0.02 to 0.19 times.
-_ITERATIONS, _SETTLED = 8, 0.03  # at each cell size: maximum, tolerance in standard deviations
+_ITERATIONS = 8  # maximum at each cell size
+_SETTLED = 0.3, 0.03  # tolerances at these, standard deviations: coarse cells only lead to the fine ones
 _MOST_RETURNS = 2000  # of a scan
 _LEAST_VARIANCE = 1e-12  # of a prior, m² and rad²
 _SHIFTS = 0.0, 1.0, -1.0, 2.0, -2.0  # cells, beyond the extent of single objects
@@ -246,7 +247,7 @@ class PlaneMap:
         """Fit the pose of a scan (N, 3), sensor frame, m, coarse to fine, given that of the prior and its covariance (6, 6)."""
         prior = prior + _LEAST_VARIANCE * np.eye(6)
         information, pose = np.linalg.inv(prior), mean if start is None else start
-        for planes in (self.coarse, self.fine):
+        for planes, settled in zip((self.coarse, self.fine), _SETTLED, strict=True):
             for _ in range(_ITERATIONS):
                 *equations, inliers = planes.agreement(scan, pose, self.variances)
                 hessian, gradient = _discount_tilts(*equations)
@@ -254,7 +255,7 @@ class PlaneMap:
                 off = gradient + information @ increments(mean, pose)
                 step = -np.linalg.solve(total, off).astype(np.float64)
                 pose = moved(pose, step)
-                if step @ total @ step < 6 * _SETTLED**2:
+                if step @ total @ step < 6 * settled**2:
                     break
         covariance = self._discount_chance(scan, pose, prior, np.linalg.inv(total))
         moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
@@ -302,10 +303,14 @@ def least_certain(covariance: Floats) -> Floats:
 
 
 def _discount_tilts(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
-    """Return Hessians (..., 6, 6) and gradients (..., 6) without the contribution of errors of the normals."""
+    """Return Hessian (6, 6) and gradient (6,) without the contribution (6, 6) of errors of the normals."""
     # Along a wall, slightly tilted normals would seem to observe the position along it.
-    M = reduction(hessian, doubt)
-    return M @ hessian @ M.swapaxes(-1, -2), np.einsum("...ij,...j->...i", M @ M, gradient)
+    try:
+        np.linalg.cholesky(hessian - doubt)
+    except np.linalg.LinAlgError:
+        M = reduction(hessian, doubt)
+        return M @ hessian @ M.T, M @ M @ gradient
+    return hessian - doubt, gradient - doubt @ np.linalg.solve(hessian, gradient)
 
 
 def _removed_share(prior: Floats, covariance: Floats) -> float:

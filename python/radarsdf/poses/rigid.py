@@ -11,14 +11,14 @@ from radarsdf.arrays import Floats
 def moved(poses: Floats, increments: Floats) -> Floats:
     """Apply increments (..., 6) to poses (..., 4, 4): a translation, m, and a rotation about the sensor, rad, in world axes."""
     found = poses.copy()
-    found[..., :3, :3] = np.einsum("...ij,...jk->...ik", rotation(increments[..., 3:]), poses[..., :3, :3])
+    found[..., :3, :3] = rotation(increments[..., 3:]) @ poses[..., :3, :3]
     found[..., :3, 3] += increments[..., :3]
     return found
 
 
 def increments(first: Floats, second: Floats) -> Floats:
     """Return the increments (..., 6) from `first` to `second` poses (..., 4, 4), the inverse of :func:`moved`."""
-    turns = np.einsum("...ij,...kj->...ik", second[..., :3, :3], first[..., :3, :3])
+    turns = second[..., :3, :3] @ first[..., :3, :3].swapaxes(-1, -2)
     return np.concatenate([second[..., :3, 3] - first[..., :3, 3], rotation_vector(turns)], axis=-1)
 
 
@@ -115,7 +115,15 @@ def assembled(matrix: Floats, translation: Floats | float = 0.0) -> Floats:
 
 def rotation_vector(matrix: Floats, near: Floats | None = None) -> Floats:
     """Convert rotations (..., 3, 3) to the rotation vectors (..., 3), rad, nearest to `near`, or to 0, up to whole turns."""
-    found = np.asarray(Rotation.from_matrix(matrix).as_rotvec())
+    axial = 0.5 * (matrix - matrix.swapaxes(-1, -2))[..., [2, 0, 1], [1, 2, 0]]
+    sine, cosine = (
+        np.sqrt((axial**2).sum(axis=-1, keepdims=True)),
+        0.5 * (np.trace(matrix, axis1=-2, axis2=-1) - 1),
+    )
+    if np.all(cosine > 0):  # much faster than Rotation, which tests that the matrix is one
+        found = axial * (np.arctan2(sine, cosine[..., None]) / np.maximum(sine, 1e-300))
+    else:
+        found = np.asarray(Rotation.from_matrix(matrix).as_rotvec())
     if near is None:
         return found
     angle = np.linalg.norm(found, axis=-1, keepdims=True)

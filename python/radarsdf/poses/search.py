@@ -180,8 +180,15 @@ class SurfaceIndex:
     def near(self, middles: Floats, reach_m: float, cells: float = 1.0) -> PlaneMap:
         """Build the planes of the surface within `reach_m` of places (K, 3)."""
         planes, points = PlaneMap(cells * self.cell_m), self.surface.points
+        x, y = points[:, 0], points[:, 1]
+        (left, lower), (right, upper) = (
+            middles[:, :2].min(axis=0) - reach_m,
+            middles[:, :2].max(axis=0) + reach_m,
+        )
+        # A query for all points of a square kilometre takes seconds.
+        points = points[(x >= left) & (x <= right) & (y >= lower) & (y <= upper)]
         within, _ = cKDTree(middles[:, :2]).query(points[:, :2], distance_upper_bound=reach_m)
-        planes.add(np.ascontiguousarray(points[np.isfinite(within)]))
+        planes.add(points[np.isfinite(within)])
         return planes
 
     def normals_at(self, points: Floats) -> Floats:
