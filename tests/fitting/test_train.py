@@ -7,8 +7,8 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.fitting import schedule as fitting_schedule
 from radarsdf.fitting import train
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.gradients import CoreGradients, sdf_loss
-from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import LossHistory
 
 from ..settings import grouped

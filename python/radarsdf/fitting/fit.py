@@ -19,8 +19,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
-from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.estimate import Schedule, check_extent, check_fit, skipped_parts
 from radarsdf.fitting.surface_returns import SurfaceReturns, average_surface, occupied_cells
 from radarsdf.fitting.train import Diverged, Interrupted, Training
 from radarsdf.map.contents import Deferred, MapContents
