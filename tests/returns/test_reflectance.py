@@ -10,8 +10,7 @@ from radarsdf.returns import reflectance, sensor
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.reflectance import Reflectance
-from radarsdf.returns.response import LEVEL, NO_SURFACE, STEEP, Response, kinds_of
+from radarsdf.returns.reflectance import LEVEL, NO_SURFACE, STEEP, Reflectance, Response, kinds_of
 from radarsdf.returns.sampling import hashes
 
 LEAF_M = 0.2

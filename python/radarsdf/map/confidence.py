@@ -13,7 +13,7 @@ from torch import Tensor
 
 from radarsdf._core import CellBlocks
 from radarsdf.arrays import Floats, Floats32
-from radarsdf.map.contents import MapContents, WholeMap
+from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import ThreadPool, resolve_num_threads, start_vector_library

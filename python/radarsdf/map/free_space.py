@@ -9,9 +9,9 @@ import numpy as np
 from radarsdf.arrays import Bools, Bytes, Floats, Ints
 from radarsdf.map import queries
 from radarsdf.map.confidence import confidence, evidence
-from radarsdf.map.contents import MapContents
-from radarsdf.returns.free_space import MOST_SCANS
+from radarsdf.map.queries import MapContents
 from radarsdf.returns.sums import lattice_of
+from radarsdf.returns.view_statistics import MOST_SCANS
 
 _ODDS_CELLS = 50_000  # sample of leaf cells that calibrates the weight of free-space crossings
 

@@ -18,8 +18,8 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.confidence import EvidenceAt, confidence, uncertainty
-from radarsdf.map.contents import MapContents
 from radarsdf.map.free_space import CellsInBox, free_space_odds
+from radarsdf.map.queries import MapContents
 from radarsdf.map.threshold import VOXEL_M
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor

@@ -10,8 +10,7 @@ import numpy as np
 
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
 from radarsdf.checks import AnyPath
-from radarsdf.config.fit_config import FitConfig, flat_settings
-from radarsdf.config.toml import to_toml
+from radarsdf.config.fit_config import FitConfig, flat_settings, to_toml
 from radarsdf.report import plots
 from radarsdf.report.errors import error_values, intensity_values, uncertainty_values
 from radarsdf.report.page import fixed, require_extras, write_page
