@@ -20,16 +20,17 @@ from radarsdf.changes.changes import (
 )
 from radarsdf.changes.compare import _classify
 from radarsdf.changes.probability import (
+    Differences,
     Errors,
     PlacedMap,
     PlaceEvidence,
     Side,
     _free_space_odds,
+    _Means,
     odds_of_differences,
     posterior,
     share_of_changes,
 )
-from radarsdf.changes.reflectance import Differences, _Means
 from radarsdf.poses.rigid import transform
 from scipy.integrate import quad
 from scipy.stats import beta, norm

@@ -16,11 +16,11 @@ from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
 from radarsdf.checks import check, not_negative, number, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.products import product
+from radarsdf.returns.intensities import sample
 from radarsdf.returns.noise import RigNoise, SensorNoise, rig_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.reflectance import of_views, regression
-from radarsdf.returns.sampling import sample
 from radarsdf.rig import Label
 
 # Quantile of azimuth, elevation and range at either end, beyond which returns count as outliers.
