@@ -25,7 +25,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.neural_field import NeuralField
-from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.surface_returns import near_leaf_keys
 from radarsdf.fitting.train import Training
 from radarsdf.returns.intensities import IntensityScale

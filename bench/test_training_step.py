@@ -11,8 +11,8 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf.field.neural_field import NeuralField
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_SAMPLES
-from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.surface_returns import near_leaf_keys
 from radarsdf.fitting.train import Training
 from radarsdf.returns.intensities import IntensityScale

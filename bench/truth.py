@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from radarsdf._core import cell_keys
 from radarsdf.evaluation import surface_metrics
 from radarsdf.simulate import Scene as World
-from radarsdf.simulate.radar import generator, unit_vectors
-from radarsdf.simulate.simulation import Lidar
+from radarsdf.simulate.radar import Lidar, generator, unit_vectors
 from scipy.spatial import cKDTree
 
 from scenes.scene import Scene

@@ -15,7 +15,7 @@ import trimesh
 from radarsdf import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.surface_returns import near_leaf_keys
 from radarsdf.fitting.train import Training
 from radarsdf.io.npz import write_scans

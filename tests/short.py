@@ -10,7 +10,7 @@ from typing import Any
 
 import radarsdf
 from radarsdf.checking import frames
-from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.render import picture
 
 from .poses.drift import first, thinned

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from radarsdf._core import vertex_areas
 from radarsdf.evaluation import confidence_metrics, surface_metrics
 from radarsdf.map.confidence import EvidenceAt, evidence, own_surface, probabilities, terms
-from radarsdf.map.contents import MapContents
 from radarsdf.map.mesh import Surface
-from radarsdf.map.queries import to_local
+from radarsdf.map.queries import MapContents, to_local
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.simulate import SCENES
 from scipy.spatial import cKDTree

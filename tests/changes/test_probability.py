@@ -19,15 +19,16 @@ from radarsdf.changes.changes import (
 )
 from radarsdf.changes.compare import _classify
 from radarsdf.changes.probability import (
+    Differences,
     Errors,
     PlaceEvidence,
     Side,
     _free_space_odds,
+    _Means,
     odds_of_differences,
     posterior,
     share_of_changes,
 )
-from radarsdf.changes.reflectance import Differences, _Means
 from scipy.integrate import quad
 from scipy.stats import beta, norm
 from scipy.stats import t as student

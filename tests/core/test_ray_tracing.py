@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf._core import SurfaceTracer, SurfelMap, cell_keys, find_free_space
-from radarsdf.returns.free_space import FreeSpace
+from radarsdf.returns.view_statistics import FreeSpace
 
 
 def unit_vectors(count, seed=0):

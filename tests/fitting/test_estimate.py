@@ -7,7 +7,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.cli import main
 from radarsdf.fitting import estimate
-from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.io.npz import write_scans
 from radarsdf.returns.rays import prepare
 from radarsdf.scans import Scans

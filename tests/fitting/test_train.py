@@ -5,10 +5,9 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.fitting import schedule as fitting_schedule
 from radarsdf.fitting import train
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.gradients import CoreGradients, sdf_loss
-from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import LossHistory
 
 from ..settings import grouped
@@ -92,7 +91,7 @@ def test_joint_iterations_are_spread_over_the_sdf_stage(scene, monkeypatch):
     monkeypatch.setattr(
         CoreGradients, "of", lambda self, kind, *of: kinds.append(kind) or usual(self, kind, *of)
     )
-    monkeypatch.setattr(fitting_schedule, "_MOST_JOINT_ITERATIONS", 50)
+    monkeypatch.setattr("radarsdf.fitting.estimate._MOST_JOINT_ITERATIONS", 50)
     config = FitConfig(effort=0.2, training={"batch_size": 64, "intensity_batch_size": 64})
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
     done = radar_map.report["iterations_done"]

@@ -9,8 +9,8 @@ from radarsdf import FitConfig
 from radarsdf.map import storage
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.radars import intensity_units
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.sensor import intensity_units
 from radarsdf.returns.sums import WEIGHT_UNIT, ReturnCells, ScanSums
 from radarsdf.scans import Scans
 

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.evaluation import KNNIntensity, holdout
-from radarsdf.fitting import steps
+from radarsdf.fitting import fit as steps
 from radarsdf.returns import intensities as plausible
 from radarsdf.returns import reflectance, sensor
-from radarsdf.returns.intensities import Intensities, Plausible
+from radarsdf.returns.intensities import Intensities, Plausible, hashes
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.reflectance import Reflectance
-from radarsdf.returns.response import LEVEL, NO_SURFACE, STEEP, Response, kinds_of
-from radarsdf.returns.sampling import hashes
+from radarsdf.returns.reflectance import LEVEL, NO_SURFACE, STEEP, Reflectance, Response, kinds_of
 
 LEAF_M = 0.2
 

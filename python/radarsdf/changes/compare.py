@@ -21,8 +21,7 @@ from radarsdf.changes.changes import (
     Changes,
     areas_of,
 )  # fmt: skip
-from radarsdf.changes.probability import Errors, PlacedMap, Side, posterior, share_of_changes
-from radarsdf.changes.reflectance import Differences
+from radarsdf.changes.probability import Differences, Errors, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.checks import check, check_box, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit

@@ -9,8 +9,7 @@ from typing import Any
 
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results
-from radarsdf.config.fit_config import FitConfig
-from radarsdf.config.toml import read_toml, to_toml
+from radarsdf.config.fit_config import FitConfig, read_toml, to_toml
 
 
 def config(given: Namespace, results: Results) -> None:

@@ -19,24 +19,20 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
-from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.estimate import Schedule, check_extent, check_fit, skipped_parts
 from radarsdf.fitting.surface_returns import SurfaceReturns, average_surface, occupied_cells
 from radarsdf.fitting.train import Diverged, Interrupted, Training
-from radarsdf.map.contents import Deferred, MapContents
-from radarsdf.map.queries import evaluate
+from radarsdf.map.queries import Deferred, MapContents, evaluate
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
-from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.moving import StaticReturns
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.reflectance import Reflectance
-from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sensor import Radars, Sensor
 from radarsdf.returns.sums import ScanSums
-from radarsdf.returns.view_statistics import ViewStatistics
+from radarsdf.returns.view_statistics import FreeSpace, ViewStatistics
 from radarsdf.rig import Label
 from radarsdf.scans import Scans, filled
 from radarsdf.threads import ThreadPool, resolve_num_threads

@@ -20,10 +20,10 @@ from radarsdf.checks import check, hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, Losses
 from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
-from radarsdf.fitting.schedule import Schedule
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale

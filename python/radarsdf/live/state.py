@@ -25,8 +25,8 @@ from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.sensor import Radars
 from radarsdf.returns.sums import ScanSums, lattice_of
 from radarsdf.rig import Label
 from radarsdf.threads import resolve_num_threads

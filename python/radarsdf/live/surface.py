@@ -29,9 +29,9 @@ from radarsdf.live.regions import (
 )
 from radarsdf.map import queries
 from radarsdf.map.confidence import interpolated
-from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.mesh import Surface
+from radarsdf.map.queries import WholeMap
 from radarsdf.returns import evidence
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise

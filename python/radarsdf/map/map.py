@@ -26,9 +26,8 @@ from radarsdf.checks import (
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
-from radarsdf.map.confidence import EvidenceAt, confidence, uncertainty
-from radarsdf.map.contents import MapContents
-from radarsdf.map.free_space import CellsInBox, free_space_odds
+from radarsdf.map.confidence import CellsInBox, EvidenceAt, confidence, free_space_odds, uncertainty
+from radarsdf.map.queries import MapContents
 from radarsdf.map.threshold import VOXEL_M
 from radarsdf.memory import check_views
 from radarsdf.products import turned
@@ -451,7 +450,7 @@ class Map(ABC):
 
     @cached_property
     def free_space_odds(self) -> Floats:
-        """See :func:`radarsdf.map.free_space.free_space_odds`."""
+        """See :func:`radarsdf.map.confidence.free_space_odds`."""
         return free_space_odds(self.contents_of_any)
 
     @abstractmethod

@@ -19,8 +19,8 @@ from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
-from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
+from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_mesh
 

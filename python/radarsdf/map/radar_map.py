@@ -14,10 +14,9 @@ from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import AnyPath
 from radarsdf.field.field import Field
 from radarsdf.map import queries, storage
-from radarsdf.map.confidence import EvidenceAt, evidence
-from radarsdf.map.contents import MapContents
-from radarsdf.map.free_space import CellsInBox, dense_cells
+from radarsdf.map.confidence import CellsInBox, EvidenceAt, dense_cells, evidence
 from radarsdf.map.map import Map, Query
+from radarsdf.map.queries import MapContents
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.sums import lattice_of
 from radarsdf.returns.view_statistics import ViewStatisticsAt

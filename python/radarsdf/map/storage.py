@@ -20,13 +20,12 @@ from radarsdf.field.field import Field, GridField
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
-from radarsdf.map.contents import MapContents
+from radarsdf.map.queries import MapContents
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
-from radarsdf.returns.view_statistics import ViewStatistics
+from radarsdf.returns.view_statistics import FreeSpace, ViewStatistics
 from radarsdf.settings import by_name, first_wrong
 
 FORMAT = "radarsdf.map"

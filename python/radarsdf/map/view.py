@@ -13,8 +13,8 @@ from radarsdf.arrays import Floats, Floats32, Ints
 from radarsdf.checks import check, flag, number, whole_number
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, roughness
-from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.mesh import Surface
+from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.map.threshold import Limits, across_triangles
 from radarsdf.memory import check_views
 from radarsdf.products import turned

@@ -20,8 +20,7 @@ from radarsdf.arrays import Array, Bytes, Floats
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
 from radarsdf.checking.recording import Finding
 from radarsdf.checks import AnyPath
-from radarsdf.config.fit_config import FitConfig, flat_settings
-from radarsdf.config.toml import to_toml
+from radarsdf.config.fit_config import FitConfig, flat_settings, to_toml
 from radarsdf.evaluation import intensity_metrics, surface_metrics, uncertainty_metrics
 from radarsdf.extras import require
 from radarsdf.io.files import write_whole

@@ -1,4 +1,4 @@
-"""Detection of intensity outliers, and the scale of the inliers."""
+"""Detection of intensity outliers, the scale of the inliers, and samples of returns that do not depend on their order."""
 
 from __future__ import annotations
 
@@ -9,9 +9,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from radarsdf.arrays import Array, Bools, Floats32, Keys
+from radarsdf.arrays import Array, Bools, Floats32, Ints, Keys
 from radarsdf.checks import check, real_array
-from radarsdf.returns.sampling import hashes, sample
+
+
+def hashes(*columns: Array) -> Keys:
+    """Return pseudo-random keys (N,) of rows with values (N,) of four bytes each; equal rows have equal keys."""
+    found = np.zeros(len(columns[0]), np.uint64)
+    for column in columns:
+        found ^= np.ascontiguousarray(column).view(np.uint32)
+        found *= np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd
+        found ^= found >> np.uint64(32)
+    return found
+
+
+def sample(keys: Keys, most: int) -> Ints:
+    """Return the rows of the `most` smallest keys (N,), or of all."""
+    return np.arange(len(keys)) if len(keys) <= most else np.argpartition(keys, most)[:most]
+
 
 # An intensity is an outlier if it lies beyond a gap and significantly outside the extrapolated tail of the inliers.
 _GAP = 3.0  # ratio of distances from the median across a gap. Tails have gaps, too

@@ -1,4 +1,7 @@
-"""Closed-form intensities: a regression on the terms of the radar equation, plus cell means of its residuals."""
+"""Closed-form intensities: a regression on the terms of the radar equation, plus cell means of its residuals.
+
+The regression is robust, on range, elevation and incidence, independent of the place.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,202 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints32, Keys
+from radarsdf.arrays import AnyFloats, Array, Bools, Floats, Floats32, Ints, Ints32, Keys
 from radarsdf.checks import check
+from radarsdf.products import normal_matrix, product
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.response import NUM_COEFFICIENTS, NUM_KINDS, TABLE_SHAPE, Response, kinds_of
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
+
+# A return lies on no known surface, on a level one or on a steep one. The ground is of another material than walls and
+# its echoes are weak at grazing angles: separate regressions reduce the error of the regression by up to 9 %. A place
+# without a plane may be unobserved, so its regression is over all returns. One over the returns without a plane would
+# treat each as clutter.
+NO_SURFACE, LEVEL, STEEP = 0, 1, 2
+NUM_KINDS = 3
+_LEVEL_COSINE = 0.7  # minimum |z| of the normal of a level surface; 0.5 to 0.7 differ by less than 1 %
+_FEWEST = 50  # minimum number of sampled returns of a kind for a regression of its own
+
+_LOBES_RAD = np.radians([3, 6, 12, 25, 50])  # standard deviations of specular lobes
+_MIN_COSINE = 0.02
+_MOST_REGRESSED = 8_000  # size of the evenly spaced sample of returns: enough for fourteen coefficients
+_REWEIGHTINGS = 2  # three are no better
+_REFERENCE_RANGE_M = 10.0
+_ROWS_AT_ONCE = 1 << 18  # chunk size: all columns at once would take 80 bytes a return
+_ANGLES_RAD = np.linspace(0, np.pi / 2, 2001)  # grid of the tabulated response to the incidence
+_BASE = 5  # number of coefficients that do not depend on the incidence
+NUM_COEFFICIENTS = _BASE + 4 + len(_LOBES_RAD)
+
+# Residuals of the regression over all returns, by range and elevation, which separate the ground from objects on it: bin
+# means, smoothed with Gaussian kernels from wide to narrow.
+TABLE_SHAPE = (48, 96)
+_LOG_RANGES = (np.log10(0.5), np.log10(200.0))  # of the table, m
+# Standard deviations in log10(range) and sine of elevation.
+_KERNELS = ((0.22, 0.083), (0.11, 0.042), (0.055, 0.021))
+_TABLE_SHRINKAGE = 1.0  # 0.5 to 2 differ by up to 2 %
+RANGE_MARGIN = 10 ** _KERNELS[0][0]
+"""Factor of the range over which residuals are averaged: views farther from all returns are unmeasured."""
+# Added to a residual, far smaller, whose range and elevation are unmeasured. The precision left is 1e-5.
+_UNMEASURED = -64.0
+_HALF = -32.0  # after the halving for a network
+
+
+@dataclass(frozen=True)
+class Response:
+    """Intensity as a function of range, elevation, incidence and the kind of surface."""
+
+    coefficients: Floats  # (3, 14) of the regression for each kind of surface
+    table: Floats32  # (48, 96) residuals of the first of them by range and elevation, plus `_UNMEASURED` far from returns
+
+    @classmethod
+    @np.errstate(under="ignore")  # lobes and kernels underflow far from their centre
+    def of(
+        cls,
+        values: Floats32,
+        directions: Floats32,
+        ranges_m: Floats32,
+        incidence_rad: Floats32,
+        kinds: NDArray[np.int8],
+    ) -> Response:
+        """Fit the response to `values` (N,) of returns; the other arguments are those of :meth:`at`."""
+        some = slice(None, None, -(-len(values) // _MOST_REGRESSED))
+        chosen, y = kinds[some], values[some].astype(np.float64)
+        rays = _of_ray(directions[some], ranges_m[some]).astype(np.float64)
+        coefficients = np.zeros((NUM_KINDS, NUM_COEFFICIENTS))
+        coefficients[:, :_BASE] = regression(rays, y)
+        left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
+        table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
+        table[~_near(_bins(_log_range(ranges_m), directions[:, 2]))] += _UNMEASURED
+        for kind in (LEVEL, STEEP):
+            own = chosen == kind
+            if np.count_nonzero(own) >= _FEWEST:
+                of_incidence = _of_incidence(incidence_rad[some][own].astype(np.float64))
+                # Both have a column of ones: the ridge makes the system regular.
+                coefficients[kind] = regression(np.concatenate([rays[own], of_incidence], axis=1), y[own])
+        return cls(coefficients, table.astype(np.float32))
+
+    @np.errstate(under="ignore")
+    def at(
+        self, directions: Floats32, ranges_m: Floats32, incidence_rad: Floats32, kinds: NDArray[np.int8]
+    ) -> Floats32:
+        """Predict values (N,) along directions (N, 3) from ranges (N,), m, at incidence angles (N,) on kinds of surface (N,)."""
+        of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
+        tables = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in self.coefficients]
+        found = np.empty(len(kinds), np.float32)
+        for first in range(0, len(kinds), _ROWS_AT_ONCE):
+            for kind in range(NUM_KINDS):
+                own = first + np.flatnonzero(kinds[first : first + _ROWS_AT_ONCE] == kind)
+                columns = _of_ray(directions[own], ranges_m[own])
+                values = _weighted_sum(self.coefficients[kind, :_BASE], columns.T)
+                if kind == NO_SURFACE:
+                    residuals = self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
+                    values += residuals - _HALF * np.rint(residuals / _HALF)
+                else:
+                    # Nearest tabulated angle: interpolation would dominate the time.
+                    nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
+                    values += tables[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
+                found[own] = values
+        return found
+
+    def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
+        """Return a mask (N,) of the directions (N, 3) and ranges (N,), m, near which there were returns."""
+        return (self.table > _HALF / 2).ravel()[_bins(_log_range(ranges_m), directions[:, 2])]
+
+
+def kinds_of(normals: Floats32, plane: Ints | Ints32) -> NDArray[np.int8]:
+    """Return the kind of surface (N,) of each return from the row `plane` (N,) of its normal in `normals` (P, 3); -1: none."""
+    # The last entry serves row -1.
+    of_plane = np.full(len(normals) + 1, NO_SURFACE, np.int8)
+    of_plane[:-1] = np.where(np.abs(normals[:, 2]) > _LEVEL_COSINE, LEVEL, STEEP)
+    return of_plane[plane]
+
+
+def _weighted_sum(weights: Floats, columns: Floats32) -> Floats32:
+    """Sum `columns` (K, N) to (N,). Not a matrix product, whose rounding depends on N and the number of threads."""
+    found = np.zeros(columns.shape[1], np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):  # the result of a non-finite query is non-finite
+        for weight, column in zip(weights.astype(np.float32), columns, strict=True):
+            found += weight * column
+    return found
+
+
+def _of_incidence(angle_rad: Floats) -> Floats:
+    """Return columns (N, 9): 1, the cosine, its square and logarithm, and the lobes."""
+    cosine = np.maximum(np.cos(angle_rad), _MIN_COSINE)
+    lobes = [np.exp(-0.5 * (angle_rad / width) ** 2) for width in _LOBES_RAD]
+    return np.stack([np.ones_like(cosine), cosine, cosine**2, np.log10(cosine), *lobes], axis=-1)
+
+
+def _of_ray(directions: Floats32, ranges_m: Floats32) -> Floats32:
+    """Return columns (N, 5): 1, the logarithm of the range and its square, the sine of the elevation and its square."""
+    log_range, up = _log_range(ranges_m), directions[:, 2]
+    return np.stack([np.ones_like(up), log_range, log_range**2, up, up**2], axis=1)
+
+
+def _log_range(ranges_m: Floats32) -> Floats32:
+    return np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
+
+
+def of_views(directions: Floats32, ranges_m: Floats32, normals: Floats, plane: Ints) -> Floats:
+    """Return columns (N, 24): those of a regression on range, elevation and incidence on planes (N,) of each kind of surface."""
+    incidence = np.arccos(np.minimum(np.abs(np.einsum("ni,ni->n", normals[plane], directions)), 1.0))
+    of_view = np.concatenate([_of_ray(directions, ranges_m)[:, 1:], _of_incidence(incidence)[:, 1:]], axis=1)
+    kinds = kinds_of(normals.astype(np.float32), plane)[:, None]
+    return np.concatenate([np.where(kinds == kind, of_view, 0.0) for kind in (LEVEL, STEEP)], axis=1)
+
+
+def _bins(log_range: AnyFloats, up: AnyFloats) -> Ints32:
+    """Return the bin (N,) of the table for each log10(range / 10 m) and sine of the elevation."""
+    rows, columns = TABLE_SHAPE
+    low, high = np.array(_LOG_RANGES) - np.log10(_REFERENCE_RANGE_M)
+    row = np.clip((log_range - low) * (rows / (high - low)), 0, rows - 1)
+    column = np.clip((up + 1) * (columns / 2), 0, columns - 1)
+    # NaN has no bin: any will do, since the prediction is NaN whatever the table holds.
+    row, column = (np.nan_to_num(place).astype(np.int32) for place in (row, column))
+    return row * np.int32(columns) + column
+
+
+def regression(design: Floats, values: Floats) -> Floats:
+    """Fit coefficients by iteratively reweighted least squares, approximately minimising the absolute error."""
+    weights = np.ones(len(values))
+    ridge = np.eye(design.shape[1]) * (1e-3 * np.sqrt(len(values)) + 1e-6 * float((design**2).sum()))
+    for _ in range(_REWEIGHTINGS):
+        weighted = design * weights[:, None]
+        right = normal_matrix(weighted, values[:, None])[:, 0]
+        coefficients: Floats = np.linalg.solve(normal_matrix(design, weighted) + ridge, right)
+        error = np.abs(values - product(design, coefficients[:, None])[:, 0])
+        weights = 1 / np.maximum(1, error / max(float(np.median(error)), 1e-9))
+    return coefficients
+
+
+def _smooth_means(bins: Ints32, values: Floats) -> Floats:
+    """Return smoothed bin means of `values` (N,): bins with few returns shrink to the mean of a wider kernel."""
+    weights, means = np.ones(len(values)), np.zeros(TABLE_SHAPE)
+    for _ in range(2):
+        error = np.abs(values - means.ravel()[bins])
+        weights = 1 / np.hypot(1, error / max(2 * float(np.median(error)), 1e-9)) if means.any() else weights
+        tables = [np.bincount(bins, w, means.size).reshape(TABLE_SHAPE) for w in (weights * values, weights)]
+        means = np.zeros(TABLE_SHAPE)
+        for widths in _KERNELS:
+            by_range, by_elevation = _kernels(widths)
+            smooth_sums, smooth_masses = (product(product(by_range, t), by_elevation) for t in tables)
+            means = (smooth_sums + _TABLE_SHRINKAGE * means) / (smooth_masses + _TABLE_SHRINKAGE)
+    return means
+
+
+def _near(bins: Ints32) -> Bools:
+    """Return a mask of the table: entries within a standard deviation of the widest kernels from a return."""
+    returns = np.bincount(bins, minlength=TABLE_SHAPE[0] * TABLE_SHAPE[1]).reshape(TABLE_SHAPE)
+    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
+    return product(product(by_range, returns), by_elevation) > 0
+
+
+def _kernels(widths: tuple[float, float]) -> list[Floats]:
+    """Return Gaussian weights of pairs of bins by range and of pairs by elevation; 1 on the diagonals."""
+    bins = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
+    places = [np.arange(n) / (width / bin_) for n, width, bin_ in zip(TABLE_SHAPE, widths, bins, strict=True)]
+    return [np.exp(-0.5 * (place[:, None] - place) ** 2) for place in places]
+
 
 # Kinds of cells: edge in leaf cells, bin width of the direction's components, bin width of the incidence in rad. Materials
 # differ in how the echo decreases with incidence, so cells by incidence help most on simulated scenes, cells by direction
@@ -52,7 +245,7 @@ class Reflectance:
     """
 
     leaf_size_m: float  # edge of a leaf cell, m
-    coefficients: Floats  # (3, 14), see :class:`~radarsdf.returns.response.Response`
+    coefficients: Floats  # (3, 14), see :class:`~radarsdf.returns.reflectance.Response`
     table: Floats32  # (48, 96) residuals of the first of them by range and elevation
     plane_keys: Keys  # (P,) Morton keys of the surfels' cells with a plane, ascending
     normals: Floats32  # (P, 3) unit normals of these planes, local frame
@@ -130,7 +323,7 @@ class Reflectance:
         )
 
     def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
-        """See :meth:`~radarsdf.returns.response.Response.measured`."""
+        """See :meth:`~radarsdf.returns.reflectance.Response.measured`."""
         return self._response.measured(directions, ranges_m)
 
     def at(

@@ -12,11 +12,17 @@ Examples
 """
 
 from .materials import Material
-from .motion import MeasuredMotion, drifted, measured_imu, measured_motion
-from .radar import Origin, RadarSensor, SimulatedScan
-from .rigs import MountedRadar, SimulatedRig, simulate_rig
+from .motion import (
+    MeasuredMotion,
+    MountedRadar,
+    SimulatedRig,
+    drifted,
+    measured_imu,
+    measured_motion,
+    simulate_rig,
+)
+from .radar import Origin, RadarSensor, SimulatedScan, Simulation, simulate
 from .scenes import SCENES, astyx, hugin, oculii, wall
-from .simulation import Simulation, simulate
 from .world import Box, CornerReflector, Hits, Pole, Primitive, Scene, Terrain
 
 __all__ = [

@@ -13,8 +13,7 @@ from radarsdf.checks import whole_number
 
 from . import materials
 from .materials import Material
-from .radar import RadarSensor, generator
-from .simulation import Simulation, simulate
+from .radar import RadarSensor, Simulation, generator, simulate
 from .world import Box, CornerReflector, Pole, Primitive, Scene, Terrain
 
 Path = Callable[[Floats], Floats]

@@ -15,8 +15,8 @@ from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
 from radarsdf.checks import AnyPath, check, positive
 from radarsdf.map import queries, storage
 from radarsdf.map.confidence import EvidenceAt, evidence
-from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map, Query
+from radarsdf.map.queries import MapContents
 from radarsdf.returns.sums import lattice_of
 from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path
 

@@ -24,9 +24,8 @@ from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.map.storage import checked_report
 from radarsdf.returns.noise import RigNoise
-from radarsdf.returns.radars import Radars
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sensor import Radars, Sensor
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.rig import Label
 from radarsdf.settings import by_name, settings

@@ -25,9 +25,8 @@ from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import StaticReturns
 from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.radars import Unit, intensity_units
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
-from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sensor import Sensor, Unit, intensity_units
 from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label
 from radarsdf.scans import Scan, scans_in_memory

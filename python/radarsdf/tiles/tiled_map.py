@@ -12,7 +12,7 @@ import numpy as np
 from radarsdf.arrays import Floats
 from radarsdf.checks import AnyPath, path_of
 from radarsdf.map import storage
-from radarsdf.map.free_space import CellsInBox, dense_cells
+from radarsdf.map.confidence import CellsInBox, dense_cells
 from radarsdf.map.map import Map
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import VOXEL_M, Threshold
