@@ -144,6 +144,7 @@ def test_scans_are_located_in_a_map(drive, motion, tmp_path, capsys):
     shown = values(capsys, "report", *there, "--locate", "-o", page)
     assert shown["found"] == FEW
     assert page.stat().st_size == shown["report_bytes"]
+    assert "the map explains" in page.read_text()
     assert refusal(capsys, tmp_path, "report", there[0], "--locate", "-o", page, status=2)
     yaw_deg = np.degrees(np.arctan2(drive.poses[0, 1, 0], drive.poses[0, 0, 0]))
     near = ["--guess", *drive.poses[0, :3, 3]]

@@ -47,6 +47,14 @@ def client(viewer):
         yield client
 
 
+def test_shares_of_explained_returns_color_the_path(sharp_map, scans):
+    explained = np.linspace(0, 1, len(scans))
+    with Viewer(sharp_map, scans, voxel_size=0.4, port=0, progress=False, explained=explained) as viewer:
+        colors = np.asarray(viewer._clouds.nodes["trajectory"].colors)
+    assert colors.shape == (len(scans) - 1, 2, 3)
+    assert len(np.unique(colors, axis=0)) == len(scans) - 1
+
+
 def mesh_of(message):
     return Glb.of(message.message["props"]["glb_data"])
 

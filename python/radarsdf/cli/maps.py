@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import radarsdf
 from radarsdf import evaluation
+from radarsdf.arrays import Floats
 from radarsdf.changes.compare import compare as compare_maps
 from radarsdf.checks import check
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
@@ -149,7 +150,8 @@ def view(given: Namespace, results: Results) -> None:
     """Serve the page until Ctrl-C, after printing its address."""
     check_address(given)
     radar_map = load_map(given.map)
-    scans, options = _scans(given, radar_map, results), {"box": given.box, "progress": results.progress}
+    scans, explained = _scans(given, radar_map, results)
+    options = {"box": given.box, "progress": results.progress, "explained": explained}
     page = {"voxel_size": given.voxel, "host": given.host, "port": given.port}
     with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer:
         url = url_of(viewer.host, viewer.port)
@@ -168,19 +170,20 @@ def report(given: Namespace, results: Results) -> None:
     check_outputs([given.out], inputs_of(given))
     radar_map = load_map(given.map)
     scans = findings = held_out = None
-    every_scan = _scans(given, radar_map, results)
+    every_scan, explained = _scans(given, radar_map, results)
     if every_scan is not None:
         findings = radarsdf.check(every_scan, config=radar_map.config)
         scans, held_out = split(every_scan, given.holdout)
     options = {"voxel_size_m": given.voxel, "box": given.box, "limits": mesh_limits(given)}
+    options["explained"] = None if given.holdout else explained
     name = given.map.absolute().name
     subject = Subject(radar_map, name, scans, held_out, findings, progress=results.progress, **options)
     add_report(results, given.out, subject)
 
 
-def _scans(given: Namespace, radar_map: Map, results: Results) -> Scans | None:
+def _scans(given: Namespace, radar_map: Map, results: Results) -> tuple[Scans | None, Floats | None]:
     if not given.locate:
-        return scans_if(given.scans, given)
+        return scans_if(given.scans, given), None
     refuse_if(not given.scans, "--locate needs the scans: name them after the map")
     return located(radar_map, unposed_scans(given), results)
 

@@ -208,7 +208,7 @@ def locate(given: Namespace, results: Results) -> None:
         guess = transform(np.array([0.0, 0.0, np.radians(yaw_deg)]), np.array(position))
     scans = unposed_scans(given)
     check_pose_times(out, scans.times_s)
-    placed = located(load_map(given.map), scans, results, guess)
+    placed, _ = located(load_map(given.map), scans, results, guess)
     lost = len(scans) - len(placed)
     write_posed(out, placed, results, f"{lost} scans are lost" if lost else "")
 
@@ -219,8 +219,10 @@ def unposed_scans(given: Namespace) -> Scans:
     return read_scans(given, UNPOSED)
 
 
-def located(radar_map: Map, scans: Scans, results: Results, guess: Floats | None = None) -> Scans:
-    """Return the scans that are found in the map, with their poses there, and print which."""
+def located(
+    radar_map: Map, scans: Scans, results: Results, guess: Floats | None = None
+) -> tuple[Scans, Floats]:
+    """Return the scans that are found in the map, with their poses there, and their explained shares, and print which."""
     found = radarsdf.locate(radar_map, scans, guess=guess)
     report = found.report
     for note in report["notes"]:
@@ -229,7 +231,8 @@ def located(radar_map: Map, scans: Scans, results: Results, guess: Floats | None
     for why in report["lost"]:
         results.add(f"lost: {why}")
     placed = scans.with_poses(np.nan_to_num(found.poses), other_world=True)
-    return placed.select(np.flatnonzero(found.segments >= 0))
+    kept = np.flatnonzero(found.segments >= 0)
+    return placed.select(kept), found.explained[kept]
 
 
 def join(given: Namespace, results: Results) -> None:

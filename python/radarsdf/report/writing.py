@@ -35,7 +35,7 @@ from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import MEANING, centre_of
 from radarsdf.view.serving import framing_pose, free_port, set_initial_camera, start_server, stop_server
-from radarsdf.view.surface import Scale, glb, templates_of, thinned
+from radarsdf.view.surface import SHARES, Scale, glb, templates_of, thinned
 
 MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
 _WIDTH, _HEIGHT = 1040, 650  # pixels
@@ -68,6 +68,7 @@ class Subject:
     voxel_size_m: float = 0.1  # voxels of the evaluated mesh
     box: ArrayLike | None = None  # (2, 3) corners of the reported part of the world, m; None: all
     progress: bool | None = None
+    explained: Floats | None = None  # (F,) shares of the returns of `scans` that the map explains
     limits: Mapping[str, Any] = field(default_factory=dict)  # limits of the mesh: arguments of `Map.mesh`
 
     @property
@@ -170,7 +171,10 @@ def surface_values(subject: Subject) -> dict[str, Any] | None:
     origin = subject.radar_map.origin
     sensors = None if subject.scans is None else subject.scans.sensor_poses[:, :3, 3] - origin
     return {
-        "scene": scene(np.asarray(mesh.vertices, np.float64) - origin, mesh.faces, colors, sensors),
+        "scene": scene(
+            np.asarray(mesh.vertices, np.float64) - origin, mesh.faces, colors, sensors, subject.explained
+        ),
+        "explained": subject.explained is not None,
         "legend": legend,
         "views": views(mesh, colors),
         "threshold": Threshold.of_mesh(subject.mesh.metadata),
@@ -327,11 +331,17 @@ def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float =
     return file.getvalue()
 
 
-def scene(vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None = None) -> str:
+def scene(
+    vertices: Floats,
+    faces: Array,
+    colors: Bytes,
+    sensors: Floats | None = None,
+    explained: Floats | None = None,
+) -> str:
     """Export a self-contained HTML page that shows a mesh in 3D, made by viser.
 
     `vertices` (V, 3) and `sensors` (F, 3), drawn as points, are in m near the origin, since the page computes in
-    float32. viser exports the scene of a server, which listens on this machine for less than a second. The addresses of
+    float32. Shares `explained` (F,) colour the sensors. viser exports the scene of a server, which listens on this machine for less than a second. The addresses of
     other machines in its program are never used; the report's content security policy forbids fetching them.
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
@@ -345,7 +355,8 @@ def scene(vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None 
         if sensors is not None:
             size = 0.008 * float(np.linalg.norm(pose.position - pose.look_at))
             style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
-            server.scene.add_point_cloud("/sensor", sensors.astype(np.float32), _SENSOR_COLOR, **style)
+            sensor_colors = _SENSOR_COLOR if explained is None else SHARES(explained)
+            server.scene.add_point_cloud("/sensor", sensors.astype(np.float32), sensor_colors, **style)
         set_initial_camera(server, pose)
         document: str = server.get_scene_serializer().as_html()
     finally:

@@ -28,6 +28,7 @@ from radarsdf.view.scene import (
 from radarsdf.view.serving import FOV_RAD, CameraPose, Page, framing_pose, set_initial_camera
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
 from radarsdf.view.surface import (
+    SHARES,
     ShownSurface,
     as_html,
     first_hit,
@@ -56,7 +57,7 @@ class Viewer(Page):
     """Serves a map, and scans to browse, in the browser until it is stopped.
 
     During a drag of the sensor, 30,000 vertices are recoloured; all of them are when it ends. The page computes in
-    float32 in the map's local frame, but displays world coordinates. `voxel_size` and `wanted` are arguments of
+    float32 in the map's local frame, but displays world coordinates. Shares `explained` (F,) colour the path. `voxel_size` and `wanted` are arguments of
     :meth:`Map.mesh`, with its errors.
     """
 
@@ -69,6 +70,7 @@ class Viewer(Page):
         max_vertices: int = 500_000,
         host: str = "127.0.0.1",
         port: int | None = None,
+        explained: Floats | None = None,
         **wanted: Any,
     ) -> None:
         super().__init__(host, port)
@@ -76,7 +78,7 @@ class Viewer(Page):
         self.surface = ShownSurface.of(radar_map, voxel_size, max_vertices=max_vertices, **wanted)
         self._start()
         try:
-            self._fill(scans)
+            self._fill(scans, explained)
         except BaseException:
             super().stop()
             raise
@@ -90,7 +92,7 @@ class Viewer(Page):
         self._painter.stop()
         super().stop()
 
-    def _fill(self, scans: Scans | None) -> None:
+    def _fill(self, scans: Scans | None, explained: Floats | None) -> None:
         server, radar_map, surface = self._server, self._map, self.surface
         origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.sensor_poses[:, :3, 3] - origin
@@ -100,7 +102,7 @@ class Viewer(Page):
         self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
         self._clicked: Floats | None = None
         panel = self._add_controls()
-        self._clouds = None if scans is None else self._add_scans(panel, scans)
+        self._clouds = None if scans is None else self._add_scans(panel, scans, explained)
         self._canvas = Canvas(server, radar_map, surface, self.quantities, self._clouds, self._describe)
         self._gizmo: Any = None
         if radar_map.has_intensity:
@@ -148,14 +150,15 @@ class Viewer(Page):
         reset.on_click(on_reset)
         return tab
 
-    def _add_scans(self, tab: Any, scans: Scans) -> ScanClouds:
+    def _add_scans(self, tab: Any, scans: Scans, explained: Floats | None) -> ScanClouds:
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
         colors: dict[str, Any] = {**SCAN_COLORS, "measured": scale or SCAN_COLORS["measured"]}
+        colors |= {} if explained is None else {"trajectory": SHARES}
         with tab, gui.add_folder("scans"):
             gui.add_html(as_html("key", colors))
             slider = gui.add_slider("scan", 0, max(len(scans) - 1, 1), 1, 0, disabled=len(scans) == 1)
-            clouds = ScanClouds(self._server, self._map, scans, scale, gui.add_markdown(""))
+            clouds = ScanClouds(self._server, self._map, scans, scale, gui.add_markdown(""), explained)
             boxes = {name: gui.add_checkbox(name, True) for name in colors}
 
         async def on_scan(_: Any) -> None:

@@ -20,7 +20,7 @@ from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
-from radarsdf.view.surface import Position, Quantity, Scale, ShownSurface, glb, shaded, spread_evenly
+from radarsdf.view.surface import SHARES, Position, Quantity, Scale, ShownSurface, glb, shaded, spread_evenly
 
 HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
 SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
@@ -204,12 +204,23 @@ class Canvas:
 class ScanClouds:
     """The sensor's path, and the returns of one scan, measured in the colours of `scale` and predicted; `text` describes it."""
 
-    def __init__(self, server: Any, radar_map: Map, scans: Scans, scale: Scale | None, text: Any) -> None:
+    def __init__(
+        self,
+        server: Any,
+        radar_map: Map,
+        scans: Scans,
+        scale: Scale | None,
+        text: Any,
+        explained: Floats | None,
+    ) -> None:
         self._server, self._map, self._scans = server, radar_map, list(scans)
         self._scale, self._text = scale, text
         self._shown: int | None = None
         path = scans.sensor_poses[:, :3, 3] - radar_map.origin
-        line = add_path(server, "/scans/path", path, SCAN_COLORS["trajectory"])
+        color = (
+            SCAN_COLORS["trajectory"] if explained is None else SHARES(explained)[:-1, None].repeat(2, axis=1)
+        )
+        line = add_path(server, "/scans/path", path, color)
         self.nodes: dict[str, Any] = {"trajectory": line}
         self.show(0)
 
@@ -250,8 +261,8 @@ class ScanClouds:
         self.nodes[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
 
 
-def add_path(server: Any, name: str, path: Array, color: tuple[int, int, int]) -> Any:
-    """Add a line through points (N, 3), m, to the scene."""
+def add_path(server: Any, name: str, path: Array, color: tuple[int, int, int] | Bytes) -> Any:
+    """Add a line through points (N, 3), m, to the scene, of one colour, or of the ends of each segment (N - 1, 2, 3)."""
     path = path.astype(np.float32)
     segments = np.stack([path[:-1], path[1:]], axis=1)
     return server.scene.add_line_segments(name, segments, color, thickness=3.0, thickness_units="screen")

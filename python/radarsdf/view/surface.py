@@ -181,6 +181,9 @@ class Scale:
         return ",".join(map(css_color, intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3].tolist()))
 
 
+SHARES = Scale(0.0, 1.0)
+
+
 @dataclass(frozen=True)
 class Quantity:
     label: str  # name and unit
