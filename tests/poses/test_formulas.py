@@ -20,7 +20,9 @@ from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, way
 from radarsdf.poses.odometry import PosedScans, pose_sigmas
 from radarsdf.poses.planes import (
     SensorReturns,
+    _discount_tilts,
     apart_m,
+    reduction,
 )
 from radarsdf.poses.rigid import (
     aligned,
@@ -309,3 +311,19 @@ def test_gains_equal_a_brute_force_search():
     expected = np.log((counts[1] + floor) / (counts[0] + floor))
     assert_allclose(_crowding(held, used, before, trajectory(4)), expected, atol=1e-9)
     assert np.ptp(expected) > 0.5
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 3.1])
+def test_rotation_vectors_are_those_of_the_matrices(angle):
+    vectors = angle * np.array([[1.0, 0, 0], [0, 0.6, -0.8], [0.48, 0.6, 0.64]])
+    assert_allclose(rotation_vector(rotation(vectors)), vectors, rtol=1e-9, atol=1e-15)
+
+
+def test_errors_of_normals_are_left_out_as_by_the_reduction():
+    half = np.random.default_rng(0).normal(size=(2, 6, 6))
+    hessian, doubt = half[0] @ half[0].T + np.eye(6), 0.01 * half[1] @ half[1].T
+    gradient = np.arange(6.0)
+    M = reduction(hessian, doubt)
+    found = _discount_tilts(hessian, gradient, doubt)
+    assert_allclose(found[0], M @ hessian @ M.T, atol=1e-9)
+    assert_allclose(found[1], M @ M @ gradient, atol=1e-9)
