@@ -35,6 +35,20 @@ def deferred_interrupts() -> Iterator[Callable[[], bool]]:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Let SIGTERM, which ends services and containers, act as Ctrl-C in a ``with`` block; as :func:`deferred_interrupts`."""
+    is_main = threading.current_thread() is threading.main_thread()
+    is_ours = is_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if is_ours:
+        signal.signal(signal.SIGTERM, lambda _number, _frame: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        if is_ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 def at_once(*calls: partial[Any]) -> list[Any]:
     """Call compiled functions in turn, and return their results. No asynchronous exception comes between them.
 

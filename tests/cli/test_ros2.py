@@ -85,7 +85,7 @@ def test_it_maps_and_publishes(posed, tmp_path, node):
                 time.sleep(0.05)
         finally:
             talking.kill()
-            live.send_signal(signal.SIGINT)  # the normal end
+            live.send_signal(signal.SIGINT if posed else signal.SIGTERM)  # the normal ends
         said = json.loads(live.communicate(timeout=TIMEOUT_S)[0])
     assert said["dropped"] == 0
     if posed:

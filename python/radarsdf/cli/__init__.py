@@ -14,6 +14,7 @@ from importlib import import_module
 
 from radarsdf.cli.options import COMMANDS, TILE_STEPS, Parser, UsageError, overview, refuse_if, steps
 from radarsdf.cli.results import Results, warn
+from radarsdf.interrupts import terminable
 
 # Errors with a message for the user. Every other error is a bug and keeps its traceback.
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
@@ -30,13 +31,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command, by default of ``sys.argv``, and return the exit status. An error is printed as one line on standard error.
 
     The status is 0 on success, 1 if the command failed or a check found an error, 2 if the command line is wrong, 130 if
-    Ctrl-C stopped it.
+    Ctrl-C or SIGTERM stopped it.
     """
     # A character that the terminal cannot encode must not discard the results so far.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
     try:
-        return _run(sys.argv[1:] if arguments is None else list(arguments))
+        with terminable():
+            return _run(sys.argv[1:] if arguments is None else list(arguments))
     except UsageError as error:
         warn(f"error: {error}")
         return 2

@@ -8,6 +8,7 @@ import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from radarsdf.view.sinks import Ros2Sink, Sink, foxglove_sink, rerun_sink
 _SHOWN_EVERY_S = 0.5
 _GRID_SHARE = 0.05  # share of the time spent on free space, for which a map is fitted anew
 _MAX_VOXELS = 500_000
+_MAX_BYTES = 200_000_000  # of the map of running topics, above which it writes its oldest scans to files
 
 
 @dataclass
@@ -150,8 +152,13 @@ def live(given: Namespace, results: Results) -> None:
             check(timed, f"{given.scans}: scans without poses need times, one per scan")
             if trajectory is not None:
                 check_pose_times(trajectory, scans.times_s)
+        folder, most = None, None
+        if request is not None:  # for hours, perhaps, of which memory holds the last scans
+            folder, most = servers.enter_context(TemporaryDirectory(prefix="radarsdf-")), _MAX_BYTES
         growing = (
-            LiveMap.load(begin) if begin else LiveMap(load_config(given), T_body_sensor=scans.T_body_sensor)
+            LiveMap.load(begin, folder=folder)
+            if begin
+            else LiveMap(load_config(given), max_bytes=most, folder=folder, T_body_sensor=scans.T_body_sensor)
         )
         if urls:
             results.add(f"live map on {' and '.join(urls)}; Ctrl-C ends it")

@@ -215,6 +215,7 @@ class Subscription:
         self._readers: dict[str, tuple[str, Any]] = {}
         self._clocks: dict[str, Clock] = {}
         self._frames: dict[str, str] = {}  # by topic of scans
+        self._found: dict[str, Any] = {}  # latest poses by frame
         self._error: Exception | None = None
         self.unposed, self.dropped, self._why = find, 0, ""
         threading.Thread(target=self._listen, daemon=True).start()
@@ -226,7 +227,7 @@ class Subscription:
     def __iter__(self) -> Iterator[Scan]:
         """Yield scans, with poses of the body if there are mountings, and note at the end what was left out."""
         mounted = self.T_body_sensor
-        for scan in posed(self._raw_scans, lambda frame: self._find(frame, _Unlogged()), self._request)():
+        for scan in posed(self._raw_scans, self._latest, self._request)():
             if mounted is None:
                 yield replace(scan, sensor=None)
             else:
@@ -245,11 +246,17 @@ class Subscription:
             with self._lock:
                 arrived_s, raw = self._queue.popleft()
             while time.monotonic() < arrived_s + longest_s and not self._stopped():
-                poses = self._find(raw.frame, _Unlogged())
+                poses = self._latest(raw.frame)
                 if poses is None or poses.pose_at(raw.time_s or 0.0, longest_s) is not None:
                     break
                 time.sleep(_STEP_S)  # the pose after the scan is yet to come
             yield raw
+
+    def _latest(self, frame: str) -> Any:
+        found = self._found  # another dict once a pose arrives
+        if frame not in found:
+            found[frame] = self._find(frame, _Unlogged())
+        return found[frame]
 
     def _find(self, frame: str, notes: Notes) -> Any:
         """Poses of a frame so far, or None. Raise a ValueError if there are none."""
@@ -371,6 +378,7 @@ class Subscription:
         if topic not in self._topics:
             with self._lock:
                 self._tracks.add(Message(Path(), topic, message_type, recorded_s, 0, stamp_s, frame, content))
+                self._found = {}
             return
         if topic not in self._clocks:
             both = np.array([[stamp_s], [recorded_s]])
