@@ -6,24 +6,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf import FitConfig, RefinedPoses
-from radarsdf.poses.agreement import (
-    CLEAR,
-    Gain,
-    Verdict,
-    _crowding,
-    _gains,
-    sign_significance,
-)
+from radarsdf.poses.agreement import CLEAR, Gain, Verdict, _crowding, _gains, sign_significance
 from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, upright
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, way
 from radarsdf.poses.odometry import PosedScans, pose_sigmas
-from radarsdf.poses.planes import (
-    SensorReturns,
-    _discount_tilts,
-    apart_m,
-    reduction,
-)
+from radarsdf.poses.planes import SensorReturns, _discount_tilts, apart_m, reduction
 from radarsdf.poses.rigid import (
     aligned,
     between,
