@@ -1,4 +1,4 @@
-"""Deferral of Ctrl-C during critical work, and changes that it cannot divide."""
+"""Deferral of Ctrl-C and SIGTERM during critical work, and changes that it cannot divide."""
 
 from __future__ import annotations
 
@@ -10,43 +10,46 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
+_STOPS = signal.SIGINT, signal.SIGTERM  # Ctrl-C, and the end of a service or container
+
 
 @contextmanager
 def deferred_interrupts() -> Iterator[Callable[[], bool]]:
     """Defer Ctrl-C in a ``with`` block, and yield a function that returns whether it was pressed.
 
     A second Ctrl-C interrupts at once. Without effect outside the main thread, which alone receives the signal, or if the
-    program has its own handler.
+    program has its own handler. SIGTERM is deferred, too, in :func:`terminable`.
     """
     pressed = False
 
     def remember(_number: int, _frame: FrameType | None) -> None:
         nonlocal pressed
         pressed = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        _exchange(remember, signal.default_int_handler)
 
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if in_main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, remember)
+    _exchange(signal.default_int_handler, remember)
     try:
         yield lambda: pressed
     finally:
-        if in_main_thread and signal.getsignal(signal.SIGINT) is remember:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        _exchange(remember, signal.default_int_handler)
 
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Let SIGTERM, which ends services and containers, act as Ctrl-C in a ``with`` block; as :func:`deferred_interrupts`."""
-    is_main = threading.current_thread() is threading.main_thread()
-    is_ours = is_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    if is_ours:
-        signal.signal(signal.SIGTERM, lambda _number, _frame: signal.raise_signal(signal.SIGINT))
+    """Let SIGTERM act as Ctrl-C in a ``with`` block: else it would end the program without its results."""
+    _exchange(signal.SIG_DFL, signal.default_int_handler, signal.SIGTERM)
     try:
         yield
     finally:
-        if is_ours:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        _exchange(signal.default_int_handler, signal.SIG_DFL, signal.SIGTERM)
+
+
+def _exchange(handler: Any, other: Any, *numbers: signal.Signals) -> None:
+    """Replace the handler of signals, if it is this one."""
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers or _STOPS:
+            if signal.getsignal(number) is handler:
+                signal.signal(number, other)
 
 
 def at_once(*calls: partial[Any]) -> list[Any]:

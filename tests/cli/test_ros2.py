@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io.npz import write_scans
-from radarsdf.scans import Scans
+from radarsdf.scans import Notes, Scans
 
 from ..conftest import ground_and_wall
 from .calls import refusal
 
 pytest.importorskip("cyclonedds", reason="topics of ROS 2 need cyclonedds")
 pytest.importorskip("rosbags")
-from radarsdf.io.ros2 import Node, make_message
+from radarsdf.io.bag_messages import POSE_TYPES, TRANSFORM_TYPES, Message, Pose
+from radarsdf.io.recordings import Request
+from radarsdf.io.ros2 import Node, Subscription, _Poses, make_message
 
 SCENE = ground_and_wall(scans=12, returns_per_scan=600)
 DOMAIN = 100 + os.getpid() % 100
@@ -85,7 +87,7 @@ def test_it_maps_and_publishes(posed, tmp_path, node):
                 time.sleep(0.05)
         finally:
             talking.kill()
-            live.send_signal(signal.SIGINT if posed else signal.SIGTERM)  # the normal ends
+            live.send_signal(signal.SIGTERM if posed else signal.SIGINT)  # the normal ends
         said = json.loads(live.communicate(timeout=TIMEOUT_S)[0])
     assert said["dropped"] == 0
     if posed:
@@ -107,6 +109,28 @@ def test_it_maps_and_publishes(posed, tmp_path, node):
         world,
         "radar",
     )  # one parent: of the talker, or ours
+
+
+def test_late_static_transforms_replace_an_assumed_mounting():
+    scans = Subscription.__new__(Subscription)
+    scans._request = Request(pose_topic="/odom", notes=Notes())
+    scans._poses = poses = _Poses(scans._request)
+    scans._frames, scans.unposed, scans._assumed = poses.frames, False, True
+    poses.add_frame("/radar/points", "radar")
+
+    def add(topic, message_type, time_s, child, parent, x):
+        pose = Pose(time_s, parent, child, (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+        poses.add(Message(Path(), topic, message_type, time_s, 0, time_s, parent, [pose]))
+
+    for time_s in (1.0, 2.0):
+        add("/odom", POSE_TYPES[0], time_s, "base", "odom", time_s)
+    assert poses.known() is poses.known()  # derived once
+    assert scans._find("radar").pose_at(1.5, 2.0)[0, 3] == 1.5
+    assert not scans.remounted()
+    add("/tf_static", TRANSFORM_TYPES[0], 3.0, "radar", "base", 2.0)
+    assert scans.remounted()
+    assert not scans.remounted()
+    assert scans._find("radar").pose_at(1.5, 2.0)[0, 3] == 3.5
 
 
 def test_other_types_are_named(node):

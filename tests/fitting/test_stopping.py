@@ -12,7 +12,7 @@ import pytest
 import radarsdf
 from radarsdf import Diverged, FitConfig, Interrupted, _core
 from radarsdf.fitting.optimiser import Adam
-from radarsdf.interrupts import deferred_interrupts
+from radarsdf.interrupts import deferred_interrupts, terminable
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 LONG = {"training": {"sdf_iterations": 1_000_000, "batch_size": 512}}
@@ -130,6 +130,17 @@ def test_only_the_first_interrupt_is_deferred():
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is usual
+
+
+def test_sigterm_acts_as_ctrl_c():
+    usual = signal.getsignal(signal.SIGTERM)
+    with terminable():
+        with deferred_interrupts() as pressed:
+            signal.raise_signal(signal.SIGTERM)
+            assert pressed()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is usual
 
 
 @pytest.fixture

@@ -1,7 +1,9 @@
 """A live map depends only on its present scans, not on how they were added, moved and removed."""
 
+import contextlib
 import errno
 import os
+import sqlite3
 import threading
 
 import numpy as np
@@ -221,17 +223,36 @@ def test_moving_several_scans_is_atomic():
     assert len(live.move_all(dict(enumerate(moved[:4])))) == 0  # nothing changes
 
 
+def stored_scans(folder):
+    with contextlib.closing(sqlite3.connect(folder / "scans.sqlite")) as file:
+        return file.execute("SELECT count(*) FROM scans").fetchone()[0]
+
+
+def test_nothing_of_scans_in_a_folder_stays_in_memory(tmp_path):
+    live, whole = map_of(range(8), folder=tmp_path / "scans"), map_of(range(8))
+    assert live._state.log.num_bytes == 0
+    assert not live._state.log._scans
+    for one in (live, whole):
+        one.move(2, SCENE.poses[3])
+        one.remove(4)
+    assert stored_scans(tmp_path / "scans") == len(live) == 7
+    assert (live.scan_ids, state(live)) == (whole.scan_ids, state(whole))
+    np.testing.assert_array_equal(live.trajectory()[1], SCENE.poses[[0, 1, 3, 3, 5, 6, 7]])
+    with pytest.raises(ValueError, match="scan_id"):
+        live.integrate(SCENE.points[4], SCENE.poses[4], SCENE.intensities[4], scan_id=(4,))
+
+
 def test_old_scans_are_stored_on_disk_or_sealed(tmp_path):
     needed = map_of(range(8)).num_bytes
     spilled = map_of(range(8), max_bytes=needed - 60_000, folder=tmp_path / "scans")
-    files = list((tmp_path / "scans").glob("scan-*.npz"))
-    assert 0 < len(files) < 8
+    stored = stored_scans(tmp_path / "scans")
+    assert 0 < stored < 8
     assert spilled.num_bytes <= needed - 60_000
     spilled.remove(0)
-    assert len(list((tmp_path / "scans").glob("scan-*.npz"))) == len(files) - 1
+    assert stored_scans(tmp_path / "scans") == stored - 1
     assert state(spilled) == state(map_of(range(1, 8)))
     sealed = map_of(range(8), max_bytes=needed - 60_000)
-    assert sealed.sealed_scans == len(files)
+    assert sealed.sealed_scans == stored
     with pytest.raises(ValueError, match="sealed"):
         sealed.remove(0)
     with pytest.raises(ValueError, match="sealed"):
@@ -249,7 +270,7 @@ def test_a_full_disk_leaves_the_map_unchanged(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("radarsdf.live.store._save", full)
+        patched.setattr("radarsdf.live.store._Rows.write", full)
         for _ in range(3):
             with pytest.raises(OSError, match="No space"):
                 live.integrate(SCENE.points[6], SCENE.poses[6], SCENE.intensities[6])
@@ -274,7 +295,7 @@ def test_a_folder_belongs_to_one_map(tmp_path):
     (folder / "notes.txt").touch()
     with pytest.raises(ValueError, match="other files"):
         LiveMap(folder=folder)
-    (tmp_path / "scan-000000001.npz").touch()  # a foreign file: no map has used this folder
+    (tmp_path / "scans.sqlite").touch()  # a foreign file: no map has used this folder
     with pytest.raises(ValueError, match="other files"):
         LiveMap(folder=tmp_path)
 

@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from argparse import Namespace
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from tempfile import TemporaryDirectory
@@ -23,31 +24,30 @@ from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
 from radarsdf.io.ros2 import Node, Subscription
-from radarsdf.live.live_map import LiveMap
+from radarsdf.live.live_map import Integrated, LiveMap
+from radarsdf.live.store import ScanId
 from radarsdf.poses.search import Lost
 from radarsdf.rig import Label
 from radarsdf.scans import Scan, Scans
 from radarsdf.view.pages import GrowingView
-from radarsdf.view.serving import url_of, wait
+from radarsdf.view.serving import WAIT_STEP_S, url_of, wait
 from radarsdf.view.sinks import Ros2Sink, Sink, foxglove_sink, rerun_sink
 
 _SHOWN_EVERY_S = 0.5
 _GRID_SHARE = 0.05  # share of the time spent on free space, for which a map is fitted anew
 _MAX_VOXELS = 500_000
-_MAX_BYTES = 200_000_000  # of the map of running topics, above which it writes its oldest scans to files
+_MAX_PATH = 2000  # positions of the trajectory shown
+_TIMED = 10_000  # last scans whose durations are reported
 
 
 @dataclass
 class Replay:
-    """Results of a replay: indices of integrated scans with their poses and seconds, and of the others."""
+    """Numbers of scans of a replay, and how long the last ones took."""
 
-    times_s: list[float] = field(default_factory=list)  # of all scans
-    timed: bool = True  # by the recording, and not 0.1 s per scan
-    rows: list[int] = field(default_factory=list)
-    poses: list[Floats] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    dropped: list[int] = field(default_factory=list)  # the map was not ready
-    lost: list[int] = field(default_factory=list)  # tracking failed for these scans without poses
+    integrated: int = 0
+    dropped: int = 0  # the map was not ready
+    lost: int = 0  # tracking failed for these scans without poses
+    seconds: deque[float] = field(default_factory=lambda: deque(maxlen=_TIMED))
     notes: tuple[str, ...] = ()  # what the pose of the last scan assumes
 
 
@@ -57,15 +57,19 @@ def replay(
     *,
     with_poses: bool = True,
     rate: float = 1.0,
-    on_scan: Callable[[Replay, Scan], None] | None = None,
+    on_scan: Callable[[Scan, Integrated], None] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Replay:
     """Integrate scans at `rate` times the recorded speed; 0: as fast as possible. A scan is dropped once the next one arrives."""
-    done = Replay()
-    first = 1 + max((known for known in live.scan_ids if isinstance(known, int)), default=-1)
+    done, before, known, tried = Replay(), len(live), len(live.scan_ids), 0
     # A node goes on after a scan that does not fit, such as one with a repeated time.
     unusable = Lost if isinstance(scans, Scans) else ValueError
-    for i, scan in _due(scans, rate, done) if isinstance(scans, Scans) else _arriving(scans, done):
+    for scan in _due(scans, rate, done, stopped) if isinstance(scans, Scans) else scans:
+        if isinstance(scans, Subscription) and scans.remounted():
+            for scan_id in live.scan_ids[known:]:
+                live.remove(scan_id)
         started = time.perf_counter()
+        tried += 1
         try:
             found = live.integrate(
                 scan.points,
@@ -73,57 +77,48 @@ def replay(
                 scan.intensities,
                 doppler_mps=scan.doppler_mps,
                 time_s=scan.time_s,
-                scan_id=first + i,
                 sensor=scan.sensor,
             )
         except unusable as error:
-            done.lost.append(i)
-            done.notes = done.notes if done.rows else (str(error),)
+            done.notes = done.notes if done.seconds else (str(error),)
             continue
         done.seconds.append(time.perf_counter() - started)
-        done.rows.append(i)
-        done.poses.append(found.pose)
         done.notes = found.notes
-        for k, row in enumerate(done.rows if found.moved else ()):
-            if first + row in found.moved:
-                done.poses[k] = live.pose(first + row)
         if on_scan is not None:
-            on_scan(done, scan)
+            on_scan(scan, found)
+    done.integrated = len(live) - before
+    done.lost = tried - done.integrated
+    if isinstance(scans, Subscription):
+        done.dropped = scans.dropped
     return done
 
 
-def _due(scans: Scans, rate: float, done: Replay) -> Iterator[tuple[int, Scan]]:
+def _due(scans: Scans, rate: float, done: Replay, stopped: Callable[[], bool]) -> Iterator[Scan]:
     """Yield the scans that are not dropped when they are due, with their poses of a body, and labels of mounted radars."""
     count = len(scans.points)
     times_s = np.asarray(0.1 * np.arange(count) if scans.times_s is None else scans.times_s)
-    done.times_s, done.timed = times_s.tolist(), scans.times_s is not None
     due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
     labels = None if scans.T_body_sensor is None else scans.sensors
     begin = time.perf_counter()
     for i in range(count):
         now = time.perf_counter() - begin
         if rate > 0 and i + 1 < count and due_s[i + 1] <= now:
-            done.dropped.append(i)
+            done.dropped += 1
             continue
-        time.sleep(max(due_s[i] - now, 0.0))
-        yield (
-            i,
-            Scan(
-                scans.points[i],
-                scans.poses[i],
-                None if scans.intensities is None else scans.intensities[i],
-                None if scans.doppler_mps is None else scans.doppler_mps[i],
-                done.times_s[i],
-                sensor=None if labels is None else labels[i],
-            ),
+        left_s = due_s[i] - now
+        while left_s > 0 and not stopped():
+            time.sleep(min(left_s, WAIT_STEP_S))
+            left_s -= WAIT_STEP_S
+        if stopped():
+            return
+        yield Scan(
+            scans.points[i],
+            scans.poses[i],
+            None if scans.intensities is None else scans.intensities[i],
+            None if scans.doppler_mps is None else scans.doppler_mps[i],
+            float(times_s[i]),
+            sensor=None if labels is None else labels[i],
         )
-
-
-def _arriving(scans: Subscription, done: Replay) -> Iterator[tuple[int, Scan]]:
-    for i, scan in enumerate(scans):
-        done.times_s.append(scan.time_s or 0.0)
-        yield i, scan
-    done.dropped = [-1] * scans.dropped  # these have no index
 
 
 def live(given: Namespace, results: Results) -> None:
@@ -140,43 +135,47 @@ def live(given: Namespace, results: Results) -> None:
         changed = begin and (given.config or given.set or given.paper)
         refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
         scans: Scans | Subscription
-        if request is not None:
-            stopped = servers.enter_context(deferred_interrupts())
-            node = servers.enter_context(contextlib.closing(Node(given.ros2_domain, given.host)))
-            scans = Subscription(node, given.ros2, request, given.find, stopped, warn)
-            sinks, unposed = [*sinks, Ros2Sink(node, scans)], scans.unposed
-            results.add(f"{', '.join(given.ros2)} mapped, the map published as /radarsdf/…; Ctrl-C ends it")
-        else:
+        if request is None:
             scans, unposed = scans_or_unposed(given, find=given.find)
-            timed = scans.times_s is not None or not unposed
+            timed = len(scans.points) and (scans.times_s is not None or not unposed)
             check(timed, f"{given.scans}: scans without poses need times, one per scan")
             if trajectory is not None:
                 check_pose_times(trajectory, scans.times_s)
-        folder, most = None, None
-        if request is not None:  # for hours, perhaps, of which memory holds the last scans
-            folder, most = servers.enter_context(TemporaryDirectory(prefix="radarsdf-")), _MAX_BYTES
-        growing = (
-            LiveMap.load(begin, folder=folder)
-            if begin
-            else LiveMap(load_config(given), max_bytes=most, folder=folder, T_body_sensor=scans.T_body_sensor)
-        )
-        if urls:
-            results.add(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
-        shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
-        done = replay(growing, scans, with_poses=not unposed, rate=given.rate, on_scan=shown)
+        # Of the scans in the map, which hours of driving are many of, memory holds only the last ones. /tmp may be memory.
+        beside = None if out is None else out.absolute().parent
+        temporary = TemporaryDirectory(prefix="radarsdf-", dir=beside, ignore_cleanup_errors=True)
+        folder = servers.enter_context(temporary)
+        with deferred_interrupts() as stopped:
+            if request is not None:
+                node = servers.enter_context(contextlib.closing(Node(given.ros2_domain, given.host)))
+                scans = Subscription(node, given.ros2, request, given.find, stopped, warn)
+                sinks, unposed = [*sinks, Ros2Sink(node, scans)], scans.unposed
+                results.add(
+                    f"{', '.join(given.ros2)} mapped, the map published as /radarsdf/…; Ctrl-C ends it"
+                )
+            growing = (
+                LiveMap.load(begin, folder=folder)
+                if begin
+                else LiveMap(load_config(given), folder=folder, T_body_sensor=scans.T_body_sensor)
+            )
+            if urls:
+                results.add(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
+            shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
+            paced = {"rate": given.rate, "on_scan": shown, "stopped": stopped}
+            done = replay(growing, scans, with_poses=not unposed, **paced)
         _add_rates(results, done)
         if out is not None:
             made = growing.map() if given.quick else growing.finish(progress=results.progress)
             made.save(out)
             results.add(f"map {out}", out=out)
         if trajectory is not None:
-            times_s = np.array(done.times_s)[done.rows] if done.timed else None
-            write_poses(trajectory, np.stack(done.poses), times_s)
+            times_s, poses = (column[-done.integrated :] for column in growing.trajectory())
+            write_poses(trajectory, poses, times_s)
             results.add(f"trajectory {trajectory}", trajectory=trajectory)
         if shown is not None:
-            shown.show(done.poses, done.times_s[done.rows[-1]], final=True)
+            shown.show(final=True)
         files.close()
-        if urls and request is None:
+        if urls and request is None and not stopped():
             results.end()
             until_stopped(wait)
 
@@ -207,25 +206,33 @@ class _Shown:
         self, live_map: LiveMap, T_body_sensor: Mapping[Label, Floats] | None, sinks: list[Sink]
     ) -> None:
         self._map, self._mountings, self._sinks = live_map, T_body_sensor, sinks
+        self._path: dict[ScanId, Floats] = {}  # positions of every n-th scan
+        self._every, self._scans, self._time_s = 1, 0, 0.0
         self._thread, self._lock = threading.Thread(), threading.Lock()
         self._next_s, self._next_grid_s = 0.0, 0.0
 
-    def __call__(self, done: Replay, scan: Scan) -> None:
-        pose, time_s = done.poses[-1], done.times_s[done.rows[-1]]
-        T = pose if self._mountings is None else pose @ self._mountings[scan.sensor]
-        scan = replace(scan, T_world_sensor=T)
+    def __call__(self, scan: Scan, found: Integrated) -> None:
+        T = found.pose if self._mountings is None else found.pose @ self._mountings[scan.sensor]
+        scan, self._time_s = replace(scan, T_world_sensor=T), scan.time_s or 0.0
         for sink in self._sinks:
-            sink.show_scan(scan, time_s)
+            sink.show_scan(scan, self._time_s)
+        if self._scans % self._every == 0:
+            self._path = self._path | {found.scan_id: found.pose[:3, 3]}
+        for scan_id in self._path.keys() & set(found.moved):
+            self._path[scan_id] = self._map.pose(scan_id)[:3, 3]
+        if len(self._path) > _MAX_PATH:
+            self._path, self._every = dict([*self._path.items()][::2]), 2 * self._every
+        self._scans += 1
         if not self._thread.is_alive() and time.monotonic() > self._next_s:
             self._next_s = time.monotonic() + _SHOWN_EVERY_S
-            self._thread = threading.Thread(target=self.show, args=[list(done.poses), time_s], daemon=True)
+            self._thread = threading.Thread(target=self.show, daemon=True)
             self._thread.start()
 
-    def show(self, poses: list[Floats], time_s: float, final: bool = False) -> None:
+    def show(self, final: bool = False) -> None:
         with self._lock:
-            mesh = self._map.mesh()
+            mesh, path, time_s = self._map.mesh(), np.array([*self._path.values()]), self._time_s
             for sink in self._sinks if len(mesh.faces) else ():
-                sink.show_surface(mesh, np.array(poses)[:, :3, 3], time_s)
+                sink.show_surface(mesh, path, time_s)
             began_s = time.monotonic()
             if self._map.config.returns.free_space and (final or began_s >= self._next_grid_s):
                 made = self._map.map()
@@ -237,12 +244,12 @@ class _Shown:
 
 
 def _add_rates(results: Results, done: Replay) -> None:
-    check(done.rows, "; ".join(["no scan was integrated into the map", *done.notes]))
-    in_map, dropped, lost = len(done.rows), len(done.dropped), len(done.lost)
-    scans = in_map + dropped + lost
-    line = f"{in_map} of {scans} scans in the map, {dropped} dropped, {lost} lost"
-    results.add("\n".join([line, *done.notes]), scans=in_map, dropped=dropped, lost=lost, notes=done.notes)
-    hertz = in_map / max(sum(done.seconds), 1e-9)
+    check(done.integrated, "; ".join(["no scan was integrated into the map", *done.notes]))
+    scans = done.integrated + done.dropped + done.lost
+    line = f"{done.integrated} of {scans} scans in the map, {done.dropped} dropped, {done.lost} lost"
+    counts = {"scans": done.integrated, "dropped": done.dropped, "lost": done.lost}
+    results.add("\n".join([line, *done.notes]), **counts, notes=done.notes)
+    hertz = len(done.seconds) / max(sum(done.seconds), 1e-9)
     p50, p99, worst = np.percentile(done.seconds, [50, 99, 100])
     results.add(
         f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99th percentile), {1e3 * worst:.1f} ms (worst): "

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from radarsdf.checks import check
 from radarsdf.extras import require
 from radarsdf.io import bag_messages
 from radarsdf.io.bag_messages import Clock, Message, decode, message_types
-from radarsdf.io.bag_poses import Track, Tracks, topic_poses, tree_poses
+from radarsdf.io.bag_poses import Track, Tracks, TransformTree, topic_poses, tree_poses
 from radarsdf.io.poses import UNPOSED, NoPoses
-from radarsdf.io.recordings import RawScan, Request, posed
+from radarsdf.io.recordings import FindPoses, RawScan, Request, posed
 from radarsdf.rig import Label
 from radarsdf.scans import Notes, Scan
 
@@ -31,7 +31,7 @@ _THIS_MACHINE = (
     "<MaxAutoParticipantIndex>99</MaxAutoParticipantIndex>"
     '<Peers><Peer address="localhost"/></Peers></Discovery>'
 )
-_QUEUED = 100  # scans: 5 s of a radar at 20 Hz
+_QUEUED = 100  # scans of a radar: 5 s at 20 Hz
 _KEPT_POSES = 1000  # of each frame: tf2 keeps those of 10 s
 _PATIENCE_S = 3.0  # for poses of the first scan, and until it is reported what is missing
 _STEP_S = 0.01
@@ -195,147 +195,93 @@ class _Unlogged(Notes):
         self.lines.append(line)
 
 
-class Subscription:
-    """Scans of running topics, with poses of a topic or of TF; with `find`, or if TF has none, `unposed`. Iteration ends when `stopped`."""
+class _Known(NamedTuple):
+    """What the poses received so far tell."""
+
+    tree: TransformTree
+    topic: Track | None  # of the poses, if they are those of a topic
+    find: FindPoses
+    error: ValueError | None  # why no frame has poses
+    notes: list[str]
+
+
+class _Poses:
+    """Poses received so far: of a topic, or else of TF. They are added and used in two threads."""
+
+    def __init__(self, request: Request) -> None:
+        self._request = request
+        self._tracks = Tracks(_RecentTrack)
+        self._lock = threading.Lock()
+        self._known: _Known | None = None  # None since a pose arrived
+        self.frames: dict[str, str] = {}  # by topic of scans
+
+    def add(self, message: Message) -> None:
+        with self._lock:
+            self._known = None
+            self._tracks.add(message)
+
+    def add_frame(self, topic: str, frame: str) -> None:
+        with self._lock:
+            self._known = None
+            self.frames.setdefault(topic, frame)
+
+    def known(self) -> _Known:
+        with self._lock:
+            self._known = self._known or self._derive()
+            return self._known
+
+    def _derive(self) -> _Known:
+        request, name = replace(self._request, notes=_Unlogged()), self._request.pose_topic
+        tree, topics = self._tracks.tree(request), self._tracks.by_topic
+        frames = [*self.frames.values(), ""]
+        sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
+        find: FindPoses = dict[str, Any]().get  # none of any frame
+        error = None
+        try:
+            if name is None:
+                find = tree_poses(tree, sensor, request)
+            else:
+                check(name in topics, f"{name} has no messages yet")
+                find = topic_poses(name, topics, tree, sensor, request)
+        except ValueError as why:
+            error = why
+        return _Known(tree, topics.get(name or ""), find, error, request.notes.lines)
+
+
+class _Listener:
+    """Receives scans and poses in its own thread, and keeps the last scans until they are taken."""
 
     def __init__(
-        self,
-        node: Node,
-        topics: Sequence[str],
-        request: Request,
-        find: bool,
-        stopped: Callable[[], bool],
-        report: Callable[[str], None],
+        self, node: Node, topics: list[str], request: Request, poses: _Poses, stopped: Callable[[], bool]
     ) -> None:
-        self._node, self._topics, self._request = node, list(dict.fromkeys(topics)), request
-        self._stopped, self._report = stopped, report
-        self._lock = threading.Lock()  # guards the queue and the poses
-        self._queue: deque[tuple[float, RawScan]] = deque()
-        self._tracks = Tracks(_RecentTrack)
+        self._node, self._topics, self._request, self._poses = node, topics, request, poses
+        self._stopped = stopped
         self._readers: dict[str, tuple[str, Any]] = {}
         self._clocks: dict[str, Clock] = {}
-        self._frames: dict[str, str] = {}  # by topic of scans
-        self._found: dict[str, Any] = {}  # latest poses by frame
         self._error: Exception | None = None
-        self.unposed, self.dropped, self._why = find, 0, ""
+        self._received, self._taken = 0, 0
+        self._queue: deque[tuple[float, RawScan]] = deque(maxlen=_QUEUED * len(topics))
         threading.Thread(target=self._listen, daemon=True).start()
-        self._await(lambda: len(self._frames) == len(self._topics))
-        until_s = time.monotonic() + _PATIENCE_S
-        self._await(lambda: self._are_posed(late=time.monotonic() > until_s))
-        self._mount()
 
-    def __iter__(self) -> Iterator[Scan]:
-        """Yield scans, with poses of the body if there are mountings, and note at the end what was left out."""
-        mounted = self.T_body_sensor
-        for scan in posed(self._raw_scans, self._latest, self._request)():
-            if mounted is None:
-                yield replace(scan, sensor=None)
-            else:
-                T = scan.T_world_sensor @ np.linalg.inv(mounted[scan.sensor])
-                yield replace(scan, T_world_sensor=T)
-        self._request.notes.end_pass()
+    @property
+    def dropped(self) -> int:
+        """Number of scans that were never taken."""
+        return self._received - self._taken - len(self._queue)
 
-    def _raw_scans(self) -> Iterator[RawScan]:
-        longest_s = self._request.max_gap_s
+    def wait(self) -> None:
+        """Wait for more messages. Raise the error of the thread, if there is one."""
+        if self._error is not None:
+            raise self._error
+        time.sleep(_STEP_S)
+
+    def take(self) -> Iterator[tuple[float, RawScan]]:
+        """Yield scans and the times of their arrival, by the monotonic clock, until it is stopped."""
         while self._queue or not self._stopped():
-            if self._error is not None:
-                raise self._error
-            if not self._queue:
-                time.sleep(_STEP_S)
-                continue
-            with self._lock:
-                arrived_s, raw = self._queue.popleft()
-            while time.monotonic() < arrived_s + longest_s and not self._stopped():
-                poses = self._latest(raw.frame)
-                if poses is None or poses.pose_at(raw.time_s or 0.0, longest_s) is not None:
-                    break
-                time.sleep(_STEP_S)  # the pose after the scan is yet to come
-            yield raw
-
-    def _latest(self, frame: str) -> Any:
-        found = self._found  # another dict once a pose arrives
-        if frame not in found:
-            found[frame] = self._find(frame, _Unlogged())
-        return found[frame]
-
-    def _find(self, frame: str, notes: Notes) -> Any:
-        """Poses of a frame so far, or None. Raise a ValueError if there are none."""
-        if self.unposed:
-            return UNPOSED
-        request, frames = replace(self._request, notes=notes), [*self._frames.values()]
-        name = request.pose_topic
-        with self._lock:
-            tree = self._tracks.tree(request)
-            sensor = next((known for known in frames if known in tree.tracks), frames[0])
-            if name is None:
-                return tree_poses(tree, sensor, request)(frame)
-            check(name in self._tracks.by_topic, f"{name} has no messages yet")
-            return topic_poses(name, self._tracks.by_topic, tree, sensor, request)(frame)
-
-    def _are_posed(self, *, late: bool) -> bool:
-        """Whether the poses of the scans are known, or are not in TF, which is certain only if they are `late`."""
-        notes, of_topic = _Unlogged(), self._request.pose_topic is not None
-        self._why = "static transforms of the radars"
-        try:
-            for frame in self._frames.values():
-                self._find(frame, notes)
-        except ValueError as error:
-            self._why = str(error)
-            if late and not of_topic:
-                if not isinstance(error, NoPoses):
-                    raise
-                self.unposed = True
-                self._request.notes.add("TF has no poses of the radar: they are estimated from its returns")
-            return self.unposed
-        with self._lock:  # static transforms may arrive after odometry
-            known = self._tracks.tree(self._request).tracks
-        if not late and not all(frame in known for frame in self._frames.values()):
-            return False
-        for line in notes.lines:
-            self._request.notes.add(line)
-        return True
-
-    def _mount(self) -> None:
-        request, frames = self._request, dict(self._frames)
-        with self._lock:
-            tree = self._tracks.tree(request)
-        _, mounted = tree.mountings([*frames.values()] or [""])
-        several = len(self._topics) > 1
-        self.T_body_sensor: dict[Label, Floats] | None = None  # by topic, of several radars
-        if several and len(mounted) == len(frames):
-            self.T_body_sensor = {topic: mounted[frame] for topic, frame in frames.items()}
-        mountable = not several or self.T_body_sensor or not self.unposed
-        check(
-            mountable, f"TF has no mountings of {frames}: to track the scans of several radars, publish them"
-        )
-        # By label of a scan: the highest frame that TF attaches rigidly to its radar, and T_carrier_sensor.
-        self.carriers: dict[Label | None, tuple[str, Floats]] = {
-            topic if several else None: tree.rigid_top(frame) for topic, frame in frames.items()
-        }
-        self.world = request.world_frame or "map"
-        if not self.unposed and frames:
-            tops = [tree.chain(frame)[-1] for frame in frames.values()]
-            track = self._tracks.by_topic.get(request.pose_topic or "")
-            self.world = track.parent if track else request.world_frame or tops[0]
-        # A frame has one parent: that of others, if there is one.
-        self.broadcasts = self.unposed and not any(top in tree.tracks for top, _ in self.carriers.values())
-
-    def _await(self, ready: Callable[[], bool]) -> None:
-        """Wait; after a while, report for what."""
-        report_s = time.monotonic() + 1.5 * _PATIENCE_S
-        while not (self._stopped() or ready()):
-            if self._error is not None:
-                raise self._error
-            if time.monotonic() > report_s:
-                report_s = np.inf
-                missing = [topic for topic in self._topics if topic not in self._frames]
-                found = self._node.published()
-                listed = ", ".join(f"{name} ({', '.join(types)})" for name, types in sorted(found.items()))
-                what = f"messages of {', '.join(missing)}" if missing else self._why
-                self._report(
-                    f"waiting for {what}; DDS domain {self._node.domain} has {listed or 'no topics'}"
-                )
-            time.sleep(_STEP_S)
+            if self._queue:
+                self._taken += 1
+                yield self._queue.popleft()
+            else:
+                self.wait()
 
     def _listen(self) -> None:
         """Subscribe to topics once they are there, and receive their messages."""
@@ -350,7 +296,7 @@ class Subscription:
                         if sample.sample_info.valid_data:
                             self._receive(topic, message_type, sample)
                 time.sleep(_STEP_S)
-        except Exception as error:  # noqa: BLE001 - raised in the thread that iterates
+        except Exception as error:  # noqa: BLE001 - raised in the thread that waits
             self._error = error
 
     def _subscribe(self) -> None:
@@ -376,20 +322,146 @@ class Subscription:
             self._request.notes.count("messages left out: they cannot be decoded", example=what)
             return
         if topic not in self._topics:
-            with self._lock:
-                self._tracks.add(Message(Path(), topic, message_type, recorded_s, 0, stamp_s, frame, content))
-                self._found = {}
+            self._poses.add(Message(Path(), topic, message_type, recorded_s, 0, stamp_s, frame, content))
             return
         if topic not in self._clocks:
             both = np.array([[stamp_s], [recorded_s]])
             self._clocks[topic] = Clock.of(both, topic, self._request.stamps, self._request.notes)
+            self._poses.add_frame(topic, frame)
         time_s = float(self._clocks[topic].times(stamp_s, recorded_s))
         label = topic if len(self._topics) > 1 else None
         name = f"{topic} at {time_s:.3f} s"
         raw = RawScan(partial(dict, content), time_s, name, frame, topic, sensor=label)
-        with self._lock:
-            self._frames.setdefault(topic, frame)
-            self._queue.append((time.monotonic(), raw))
-            if len(self._queue) > _QUEUED:
-                self._queue.popleft()
-                self.dropped += 1
+        self._received += 1
+        self._queue.append((time.monotonic(), raw))
+
+
+class Subscription:
+    """Scans of running topics, with poses of a topic or of TF; with `find`, or if TF has none, `unposed`. Iteration ends when `stopped`."""
+
+    def __init__(
+        self,
+        node: Node,
+        topics: Sequence[str],
+        request: Request,
+        find: bool,
+        stopped: Callable[[], bool],
+        report: Callable[[str], None],
+    ) -> None:
+        self._node, self._topics, self._request = node, list(dict.fromkeys(topics)), request
+        self._stopped, self._report = stopped, report
+        self._poses = _Poses(request)
+        self._frames = self._poses.frames
+        self._listener = _Listener(node, self._topics, request, self._poses, stopped)
+        self.unposed, self._why = find, ""
+        self._await_poses()
+        self._assumed = self._is_assumed()
+        known, mounted = self._poses.known(), self._mounted()
+        for line in () if self.unposed else known.notes:
+            request.notes.add(line)
+        # By topic, of several radars.
+        self.T_body_sensor: dict[Label, Floats] | None = (
+            mounted if len(self._topics) > 1 and mounted else None
+        )
+        self.world = request.world_frame or "map"
+        if not self.unposed and self._frames:
+            root = known.tree.chain(next(iter(self._frames.values())))[-1]
+            self.world = known.topic.parent if known.topic else request.world_frame or root
+
+    @property
+    def dropped(self) -> int:
+        """Number of scans that arrived faster than they were taken, or before the mountings."""
+        return self._listener.dropped
+
+    def carrier(self, label: Label | None) -> tuple[str, Floats, bool]:
+        """Return the highest frame that TF attaches rigidly to a radar, T_carrier_sensor (4, 4), and whether others publish its pose."""
+        tree = self._poses.known().tree
+        top, T_top_sensor = tree.rigid_top(self._frames[self._topics[0] if label is None else str(label)])
+        return top, T_top_sensor, top in tree.tracks
+
+    def remounted(self) -> bool:
+        """Whether static transforms arrived only now, and the poses of a topic were taken as those of the radar meanwhile."""
+        before, self._assumed = self._assumed, self._is_assumed()
+        return before and not self._assumed
+
+    def _is_assumed(self) -> bool:
+        tree, topic = self._poses.known().tree, self._poses.known().topic
+        if topic is None or self._request.extrinsic is not None or not self._frames:
+            return False
+        sensor = next(iter(self._frames.values()))
+        top = tree.mounted_on(sensor)
+        return tree.mounted_on(topic.child) != top if topic.child else top == sensor
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Yield scans, with poses of the body if there are mountings, and note at the end what was left out."""
+        mounted = self.T_body_sensor
+        for scan in posed(self._raw_scans, self._find, self._request)():
+            if mounted is None:
+                yield replace(scan, sensor=None)
+            else:
+                T = scan.T_world_sensor @ np.linalg.inv(mounted[scan.sensor])
+                yield replace(scan, T_world_sensor=T)
+        self._request.notes.end_pass()
+
+    def _raw_scans(self) -> Iterator[RawScan]:
+        longest_s = self._request.max_gap_s
+        for arrived_s, raw in self._listener.take():
+            while time.monotonic() < arrived_s + longest_s and not self._stopped():
+                poses = self._find(raw.frame)
+                if poses is None or poses.pose_at(raw.time_s or 0.0, longest_s) is not None:
+                    break
+                self._listener.wait()  # the pose after the scan is yet to come
+            yield raw
+
+    def _find(self, frame: str) -> Any:
+        return UNPOSED if self.unposed else self._poses.known().find(frame)
+
+    def _mounted(self) -> dict[Label, Floats]:
+        """T_body_sensor by topic; empty if TF does not mount all radars on one body."""
+        frames = dict(self._frames)
+        _, mounted = self._poses.known().tree.mountings([*frames.values()] or [""])
+        complete = len(mounted) == len(set(frames.values()))
+        return {topic: mounted[frame] for topic, frame in frames.items()} if complete else {}
+
+    def _await_poses(self) -> None:
+        """Wait until poses of the scans are known, or that there are none; after a while, report for what."""
+        begin_s, late_s = time.monotonic(), np.inf
+        report_s = begin_s + 1.5 * _PATIENCE_S
+        while not self._stopped():
+            missing = [topic for topic in self._topics if topic not in self._frames]
+            why = f"messages of {', '.join(missing)}"
+            if not missing:
+                late_s = min(late_s, time.monotonic() + _PATIENCE_S)
+                why = self._missing(late=time.monotonic() > late_s)
+                if not why:
+                    return
+            if time.monotonic() > report_s:
+                report_s = np.inf
+                found = self._node.published()
+                listed = ", ".join(f"{name} ({', '.join(types)})" for name, types in sorted(found.items()))
+                self._report(f"waiting for {why}; DDS domain {self._node.domain} has {listed or 'no topics'}")
+            self._listener.wait()
+
+    def _missing(self, *, late: bool) -> str:
+        """Return what is missing for the poses of the scans. Only `late`, it is certain that TF has none."""
+        known, several = self._poses.known(), len(self._topics) > 1
+        if (
+            late
+            and self._request.pose_topic is None
+            and isinstance(known.error, NoPoses)
+            and not self.unposed
+        ):
+            self.unposed = True
+            self._request.notes.add("TF has no poses of the radar: they are estimated from its returns")
+        if several and (self.unposed or known.topic) and not self._mounted():
+            return f"static transforms that mount {', '.join(self._frames.values())} on one body"
+        if self.unposed:
+            return ""
+        if known.error is not None:
+            return str(known.error)
+        unposed = [frame for frame in self._frames.values() if known.find(frame) is None]
+        if unposed:
+            return f"transforms from the poses to {', '.join(unposed)}"
+        # Static transforms may arrive after odometry.
+        attached = known.tree.tracks.keys() >= set(self._frames.values())
+        return "" if late or attached else "static transforms of the radars"

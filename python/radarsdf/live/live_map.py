@@ -6,6 +6,7 @@ import dataclasses
 import os
 import threading
 import weakref
+from collections import deque
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -34,6 +35,8 @@ from radarsdf.scans import Scans
 
 if TYPE_CHECKING:
     import trimesh
+
+_MOST_UNPLACED = 10 * SUBMAP_SCANS  # lost scans to search the map for
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,11 @@ class LiveMap:
         ``config.lattice``.
     max_bytes : int, optional
         Memory limit, bytes, above which the oldest scans are sealed: they stay in the map, but can no longer be moved or
-        removed. Default: no limit.
+        removed. Default: no limit; with a folder, all scans are written there.
     folder : path-like, optional
-        An empty, new or previously used folder, to which scans are written instead of being sealed, and regions instead of
-        being discarded by :meth:`clear_outside`. It is locked during the lifetime of the map.
+        An empty, new or previously used folder, to which scans are written instead of being sealed, so that the memory does
+        not grow with their number, and regions instead of being discarded by :meth:`clear_outside`. It is locked during the
+        lifetime of the map.
     T_body_sensor : mapping, optional
         Mounting (4, 4) of each radar of a rig by its label, m. Poses are then T_world_body.
 
@@ -131,7 +135,10 @@ class LiveMap:
         mountings = None if T_body_sensor is None else checked_mountings(T_body_sensor)
         self._state = GrowingState(config, corner, most, place, mountings)
         self._follower = Follower(config, num_radars=max(len(mountings or ()), 1))
-        self._unplaced: list[tuple[ScanId | None, LoggedScan]] = []  # since tracking was lost
+        # Last scans since tracking was lost, and their number.
+        self._unplaced: deque[tuple[ScanId | None, LoggedScan]] = deque(maxlen=_MOST_UNPLACED)
+        self._lost = 0
+        self._index: tuple[int, SurfaceIndex] | None = None  # of the state of the map of this number
         self._pid = os.getpid()
         self._lock = threading.RLock()  # guards the state
         self._reading = threading.Lock()  # guards its surface; acquired first
@@ -189,10 +196,17 @@ class LiveMap:
             If there is no such scan, or it was sealed.
         """
         with self._lock:
-            entry = self._state.log.entry(scan_id)
-            if entry is None:
+            found = self._state.log.find(scan_id)
+            if found is None:
                 raise KeyError(scan_id)
-            return entry.pose.copy()
+            return found.pose.copy()
+
+    def trajectory(self) -> tuple[Floats, Floats]:
+        """Return the times (F,), s, NaN where unknown, and the poses (F, 4, 4) of the scans of :attr:`scan_ids`."""
+        with self._owned(changes=False):
+            known = [(scan.time_s, scan.pose) for scan in self._state.log.scans()]
+        times_s = np.array([np.nan if time_s is None else time_s for time_s, _ in known])
+        return times_s, np.array([pose for _, pose in known]).reshape(-1, 4, 4)
 
     def integrate(
         self,
@@ -226,7 +240,7 @@ class LiveMap:
         time_s : float, optional
             Time of the scan, s. Required for scans without a pose, and for the scans before them.
         scan_id : hashable, optional
-            Identifier of the scan. Default: a consecutive number.
+            Identifier of the scan; with a folder, a string or an integer of 64 bits. Default: a consecutive number.
         sensor : hashable, optional
             Label of its radar in `T_body_sensor`. Required in the map of a rig, whose radars may measure at the same time.
 
@@ -250,24 +264,34 @@ class LiveMap:
             scan = dataclasses.replace(scan, radar=Mounted(sensor, mountings[sensor]))
         given = None if pose is None else check_pose(pose, "pose").copy()
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
+        if self._state.log.folder is not None:
+            storable = (
+                scan_id is None or type(scan_id) is str or (type(scan_id) is int and abs(scan_id) < 2**63)
+            )
+            check(
+                storable,
+                f"with a folder, scan_id must be a string or an integer of 64 bits, not {scan_id!r:.50}",
+            )
         check(given is not None or scan.time_s is not None, "a scan needs a pose, or a time")
         try:
             found = self._integrate(scan, given, scan_id, far)
         except Elsewhere as lost:
             self._unplaced.append((scan_id, scan))
+            self._lost += 1
             *earlier, (scan, pose, scan_id) = self._find_again(lost)
             for before, at, before_id in earlier:
                 self._integrate(before, at, before_id, 0)
             found = self._integrate(scan, pose, scan_id, far)
         self._unplaced.clear()
+        self._lost = 0
         return found
 
     def _find_again(self, lost: Lost) -> list[tuple[LoggedScan, Floats, ScanId | None]]:
         """Search the map for the scans since tracking was lost; return them with poses and ids. Raise `lost` until they are found."""
         scans = [scan for _, scan in self._unplaced]
-        if len(scans) % SUBMAP_SCANS or len(self) == 0:
+        if self._lost % SUBMAP_SCANS or len(self) == 0:
             raise lost
-        leaf_m, labels = self.config.leaf_size_m, [scan.label for scan in scans]
+        labels, number = [scan.label for scan in scans], self._state.number
         speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
         drive = Scans(
             [scan.points for scan in scans],
@@ -278,8 +302,9 @@ class LiveMap:
             T_body_sensor=self._state.mountings,
         )
         try:
-            index = SurfaceIndex.of_mesh(self.mesh(), leaf_m)
-            found = locate(index, drive, config=self.config, progress=False)
+            if self._index is None or self._index[0] != number:
+                self._index = number, SurfaceIndex.of_mesh(self.mesh(), self.config.leaf_size_m)
+            found = locate(self._index[1], drive, config=self.config, progress=False)
         except ValueError as why:
             raise lost from why
         rows = np.flatnonzero((found.segments == found.segments[-1]) & (found.segments >= 0))

@@ -34,6 +34,8 @@ from radarsdf.threads import resolve_num_threads
 _Scans = dict[ScanId, LoggedScan]
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # placeholder until it is estimated from scans
 _NOISE_RETURNS = 100_000  # sample for the noise, enough to include the required returns on flat surfels
+# Rays of a fit, for free space and intensities, which take 100 bytes each: surfaces are those of the sums of all.
+_FIT_RETURNS = 4_000_000
 
 
 class GrowingState:
@@ -59,7 +61,7 @@ class GrowingState:
         self.quick = FitConfig.quick(**same, encoding={"bridge_cells": config.encoding.bridge_cells})
         self.origin = origin
         self.max_bytes = max_bytes
-        self.log = ScanLog(folder)
+        self.log = ScanLog(folder, mountings)
         self.track = Track()
         self._store = RegionStore(folder)
         self._away = NO_KEYS  # ascending keys of the regions on disk
@@ -68,6 +70,7 @@ class GrowingState:
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
         self.next_id = 0
+        self.number = 0  # of the state of the sums: another one after each change
         self._noise_of = 0  # number of scans at the last estimate of the noise
         self._changed: set[int] = set()  # keys of the blocks to update in the surface
         self._surface: GrowingSurface | None = None
@@ -89,7 +92,7 @@ class GrowingState:
         except BaseException:  # such as a full disk
             self._apply(left, come, before)
             raise
-        before["log"].unlink(left)
+        self.log.tidy()
         return blocks
 
     def _apply(self, come: _Scans, gone: _Scans, new: dict[str, Any]) -> Keys:
@@ -105,6 +108,7 @@ class GrowingState:
     def _commit(self, change: partial[Any], blocks: Keys | None, **new: Any) -> Keys:
         """Change the sums and set attributes at once. Return the changed blocks: `blocks`, or those that `change` returns."""
         surface, self._surface = self._surface, None  # an interruption after the change discards it
+        self.number += 1
         result, _ = at_once(change, partial(vars(self).update, new))
         changed = result[0] if blocks is None else blocks
         self._changed.update(changed.tolist())
@@ -112,10 +116,11 @@ class GrowingState:
         return changed
 
     def _bound(self) -> None:
-        if self.max_bytes is not None and self.num_bytes > self.max_bytes:
-            if self._noise_of == 0:  # the scans for its estimate may be sealed
+        most = (np.inf if self.log.folder is None else 0) if self.max_bytes is None else self.max_bytes
+        if self.num_bytes > most:
+            if self._noise_of == 0 and self.log.folder is None:  # the scans for its estimate may be sealed
                 self._settle_noise()
-            self.log = self.log.shrunk(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
+            self.log = self.log.shrunk(int(max(0, most - (self.num_bytes - self.log.num_bytes))))
 
     def clear_outside(self, centre: Floats, radius_m: float) -> Keys:
         keys = self.sums.block_keys()
@@ -208,16 +213,17 @@ class GrowingState:
         self.log.sealed |= set(described.sealed)
         self._bound()
 
-    def scans(self) -> list[LoggedScan]:
-        """Return the scans that are not sealed. Raise a ValueError if there are none."""
-        scans = list(self.log.scans())
+    def scans(self, every: int = 1) -> list[LoggedScan]:
+        """Return every n-th scan that is not sealed. Raise a ValueError if there are none."""
+        scans = list(self.log.scans(every))
         check(scans, "there are no scans to fit: integrate some first")
         return scans
 
     def fit_input(self) -> Callable[[], FitInput]:
-        """Return a function for the input of a fit of all scans, with the incremental sums."""
-        scans, sums, visibility, origin = self.scans(), self._all_sums(), self._visibility(), self.origin
-        sealed = bool(self.log.sealed)
+        """Return a function for the input of a fit of all scans, with the incremental sums, and an even sample of many rays."""
+        sums, visibility, origin = self._all_sums(), self._visibility(), self.origin
+        every = 1 + int(sums.counts.sum()) // _FIT_RETURNS
+        scans, is_part = self.scans(every), every > 1 or bool(self.log.sealed)
 
         def read() -> FitInput:
             rays = _rays_of(scans, self.config, origin).without_outliers()
@@ -227,8 +233,8 @@ class GrowingState:
             if rig is not None:
                 radars = Radars.of(rays, rig.labels, self.config, self._num_threads)
                 rays = radars.in_one_unit(rays)
-            # The sums do not weight returns by the noise of their radars, but have those of sealed scans.
-            used = sums if rig is None or sealed else None
+            # The sums do not weight returns by the noise of their radars, but have those of all scans.
+            used = sums if rig is None or is_part else None
             scale = IntensityScale.of(rays.intensities)
             return FitInput(rays, scale, poses, moving, sums=used, radars=radars, visibility=visibility)
 

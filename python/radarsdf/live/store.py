@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import sqlite3
+import weakref
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,10 +29,10 @@ ScanId = Hashable
 # Arrays of a scan, and their types.
 _KINDS = {"points": "f", "intensities": "f", "doppler_mps": "f", "is_static": "b"}
 
-# A file in the locked folder is used only once it is complete, so it needs no temporary one, as the state does. Writing it takes
-# 0.5 ms, a fifth of :func:`write_arrays`.
+# A file in the locked folder is used only once it is complete, so it needs no temporary one, as the state does.
 _save: Callable[..., None] = np.savez
 _LOCK = "live.lock"  # also marks a folder as used by a map
+_SCANS = "scans.sqlite"
 _BYTES_OF_SCAN = 1000  # approximate overhead of a scan
 _CELL_COLUMNS: dict[str, tuple[Any, ...]] = {
     "keys": (np.uint64, None),
@@ -43,7 +46,7 @@ _CELL_COLUMNS: dict[str, tuple[Any, ...]] = {
 def locked_folder(folder: Path) -> int:
     """Create the folder of one map, and lock it until the returned descriptor is closed."""
     folder.mkdir(exist_ok=True)
-    ours = (_LOCK, "*scan-*.npz*", "*region-*.npz*") if (folder / _LOCK).is_file() else ()
+    ours = (_LOCK, f"{_SCANS}*", "region-*.npz") if (folder / _LOCK).is_file() else ()
     known = all(any(path.match(name) for name in ours) for path in folder.iterdir())
     check(known, f"{folder} holds other files: give an empty or new folder")
     return take_lock(folder / _LOCK, "used")
@@ -99,18 +102,6 @@ def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
     return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
 
-@dataclass(frozen=True)
-class _OnDisk:
-    pose: Floats
-    path: Path
-    time_s: float | None
-    radar: Mounted | None
-    num_bytes: int = _BYTES_OF_SCAN // 2
-
-    def read(self) -> LoggedScan:
-        return _scan_of(arrays_of(self.path, _KINDS), self.pose, self.time_s, self.radar)
-
-
 def _scan_of(
     arrays: Mapping[str, Array], pose: Floats, time_s: float | None, radar: Mounted | None
 ) -> LoggedScan:
@@ -123,101 +114,187 @@ def _scan_of(
     return LoggedScan(pose, **arrays, time_s=time_s, radar=radar)
 
 
-class ScanLog:
-    """Scans by id, in order of insertion. Changes return a new log, and leave the files of this one.
+class _Rows:
+    """Rows of scans in a file, which never change: a change of the map adds others, so that it can be undone."""
 
-    To limit memory, the oldest are written to `folder`. Without a folder they are sealed: they stay in the map, but can no
-    longer be removed.
+    def __init__(self, folder: Path | None) -> None:
+        self._path = (folder or Path()) / _SCANS
+
+    @cached_property
+    def _opened(self) -> sqlite3.Connection:
+        self._path.unlink(missing_ok=True)  # of another map
+        opened = sqlite3.connect(self._path, check_same_thread=False)  # a lock of the map guards it
+        weakref.finalize(self, opened.close)
+        # No process reads the file after this one: it need not survive a crash.
+        opened.executescript(
+            "PRAGMA journal_mode = MEMORY; PRAGMA synchronous = OFF;"
+            f"CREATE TABLE scans(number INTEGER PRIMARY KEY, place, id, pose, time_s, radar, {', '.join(_KINDS)});"
+            "CREATE INDEX of_id ON scans(id); CREATE INDEX in_order ON scans(place, id)"
+        )
+        return opened
+
+    def read(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
+        with self._transaction() as rows:
+            return rows.execute(f"SELECT {query}", values).fetchall()
+
+    def write(self, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Write rows, in place of those of an undone change from the number of the first on."""
+        with self._transaction() as known:
+            known.execute("DELETE FROM scans WHERE number >= ?", rows[0][:1])
+            known.executemany(f"INSERT INTO scans VALUES ({', '.join('?' * len(rows[0]))})", rows)
+
+    def delete(self, numbers: Iterable[int]) -> None:
+        with self._transaction() as rows:
+            rows.executemany("DELETE FROM scans WHERE number = ?", [(number,) for number in numbers])
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with self._opened:
+                yield self._opened
+        except sqlite3.Error as error:
+            msg = f"{self._path}: {error}"
+            raise OSError(msg) from error
+
+
+class ScanLog:
+    """Scans by id, in order of insertion. Changes return a new log, and leave what is stored of this one.
+
+    To limit memory, the oldest are written to `folder`, which leaves nothing of them in memory. Without a folder they are
+    sealed: they stay in the map, but can no longer be removed.
     """
 
-    def __init__(self, folder: Path | None = None) -> None:
+    def __init__(self, folder: Path | None = None, mountings: Mapping[Label, Floats] | None = None) -> None:
         self.folder = folder
-        self._scans: dict[ScanId, LoggedScan | _OnDisk] = {}
+        self._scans: dict[ScanId, LoggedScan] = {}  # in memory: newer than all in the folder
         self.sealed: set[ScanId] = set()
-        self._written = 0
         self.num_bytes = 0  # memory of the scans
+        self.edits = 0  # changes other than the addition of scans
+        self._radars = [Mounted(*of) for of in (mountings or {}).items()]
+        self._rows = _Rows(folder)
+        self._stored = 0  # scans in the folder: in rows before the end, apart from those
+        self._end = 0
+        self._gone: frozenset[int] = frozenset()
 
     def __len__(self) -> int:
-        return len(self._scans) + len(self.sealed)
+        return len(self._scans) + len(self.sealed) + self._stored
 
     def __contains__(self, scan_id: ScanId) -> bool:
-        return scan_id in self._scans or scan_id in self.sealed
+        return scan_id in self._scans or scan_id in self.sealed or self._row(scan_id) is not None
+
+    def _row(self, scan_id: ScanId) -> tuple[int, int] | None:
+        """Return the numbers of the row of a scan in the folder, and of its place in order; None if there is none."""
+        if not self._stored or scan_id in self._scans:
+            return None
+        rows = self._rows.read("number, place FROM scans WHERE id = ? AND number < ?", scan_id, self._end)
+        return next(((number, place) for number, place in rows if number not in self._gone), None)
 
     @property
     def ids(self) -> list[ScanId]:
         """Identifiers of the scans that can be removed."""
-        return list(self._scans)
+        if not self._stored:
+            return [*self._scans]
+        stored = self._rows.read("id, number FROM scans WHERE number < ? ORDER BY place", self._end)
+        return [*(scan_id for scan_id, number in stored if number not in self._gone), *self._scans]
 
-    def entry(self, scan_id: ScanId) -> LoggedScan | _OnDisk | None:
-        """Return the entry with the pose and the time of a scan. None if it cannot be removed."""
-        return self._scans.get(scan_id)
+    def find(self, scan_id: ScanId) -> LoggedScan | None:
+        """Return a scan. None if it cannot be removed."""
+        row = self._row(scan_id)
+        if row is None:
+            return self._scans.get(scan_id)
+        columns = f"pose, time_s, radar, {', '.join(_KINDS)} FROM scans WHERE number = ?"
+        ((pose, time_s, radar, *blobs),) = self._rows.read(columns, row[0])
+        arrays = [
+            None if blob is None else np.frombuffer(blob, chr(blob[0]), offset=1).copy() for blob in blobs
+        ]
+        held: dict[str, Any] = dict(zip(_KINDS, arrays, strict=True))
+        held["points"] = held["points"].reshape(-1, 3)
+        mounted = None if radar is None else self._radars[radar]
+        return LoggedScan(np.frombuffer(pose).reshape(4, 4).copy(), **held, time_s=time_s, radar=mounted)
 
     def get(self, scan_id: ScanId) -> LoggedScan:
         """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
         sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
         check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
-        if scan_id not in self._scans:
+        found = self.find(scan_id)
+        if found is None:
             msg = f"the map has no scan {scan_id!r}"
             raise KeyError(msg)
-        found = self._scans[scan_id]
-        return found.read() if isinstance(found, _OnDisk) else found
+        return found
 
     def scans(self, every: int = 1) -> Iterator[LoggedScan]:
         """Iterate over every n-th scan that can be removed, in order."""
         return (self.get(scan_id) for scan_id in self.ids[::every])
 
-    def put(self, scan_id: ScanId, scan: LoggedScan | _OnDisk) -> None:
+    def put(self, scan_id: ScanId, scan: LoggedScan) -> None:
         """Add a scan, or replace it in place."""
         before = self._scans.get(scan_id)
         self._scans[scan_id] = scan
         self.num_bytes += scan.num_bytes - (0 if before is None else before.num_bytes)
 
     def exchanged(
-        self, new: Mapping[ScanId, LoggedScan | _OnDisk], old: Iterable[ScanId], sealed: Sequence[ScanId] = ()
+        self, new: Mapping[ScanId, LoggedScan], old: Iterable[ScanId], sealed: Iterable[ScanId] = ()
     ) -> ScanLog:
         """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
+        old, sealed = set(old), set(sealed)
         log = copy(self)
         log._scans = self._scans.copy()
+        log.edits += bool(old)
         if sealed:
-            log.sealed = self.sealed.union(sealed)
-        for scan_id in set(old).union(sealed) - new.keys():
+            log.sealed = self.sealed | sealed
+        stored = {scan_id: row for scan_id in old if (row := self._row(scan_id)) is not None}
+        log._gone = self._gone.union(number for number, _ in stored.values())
+        log._stored -= len(stored)
+        for scan_id in (old | sealed) - new.keys() - stored.keys():
             log.num_bytes -= log._scans.pop(scan_id).num_bytes
-        for scan_id, scan in new.items():
-            log._written += isinstance(scan, _OnDisk)
-            log.put(scan_id, scan)
+        log._write(
+            [(place, scan_id, new[scan_id]) for scan_id, (_, place) in stored.items() if scan_id in new]
+        )
+        for scan_id in new.keys() - stored.keys():
+            log.put(scan_id, new[scan_id])
         return log
 
-    def unlink(self, scan_ids: Iterable[ScanId]) -> None:
-        """Delete the files of scans, which another log has replaced."""
-        for scan_id in scan_ids:
-            if isinstance(there := self._scans[scan_id], _OnDisk):
-                with suppress(OSError):  # a leftover file is harmless
-                    there.path.unlink()
+    def _write(self, scans: Sequence[tuple[int, ScanId, LoggedScan]]) -> None:
+        """Write scans with their places and ids to the folder."""
+        if not scans:
+            return
+        labels, rows = [radar.label for radar in self._radars], []
+        for number, (place, scan_id, scan) in enumerate(scans, self._end):
+            held = [scan.arrays.get(name) for name in _KINDS]
+            blobs = [None if array is None else array.dtype.char.encode() + array.tobytes() for array in held]
+            radar = None if scan.radar is None else labels.index(scan.label)
+            rows.append((number, place, scan_id, scan.pose.tobytes(), scan.time_s, radar, *blobs))
+        self._rows.write(rows)
+        self._end += len(rows)
+        self._stored += len(rows)
+
+    def tidy(self) -> None:
+        """Delete rows that no log uses any more, as this one is in the map."""
+        if self._gone:
+            with suppress(OSError):  # leftover rows are harmless
+                self._rows.delete(self._gone)
+                self._gone = frozenset()
 
     def shrunk(self, max_bytes: int) -> ScanLog:
         """Return a log with the oldest scans in memory written or sealed until they fit into `max_bytes`."""
-        come: dict[ScanId, _OnDisk] = {}
-        sealed, excess = [], self.num_bytes - max_bytes
+        oldest, excess = [], self.num_bytes - max_bytes
         for scan_id, scan in self._scans.items():
             if excess <= 0:
                 break
-            if isinstance(scan, _OnDisk):
-                continue
             excess -= scan.num_bytes
-            if self.folder is None:
-                sealed.append(scan_id)
-                continue
-            path = self.folder / f"scan-{self._written + len(come):09d}.npz"
-            _save(path, **scan.arrays)
-            come[scan_id] = on_disk = _OnDisk(scan.pose, path, scan.time_s, scan.radar)
-            excess += on_disk.num_bytes
-        return self.exchanged(come, (), sealed)
+            oldest.append(scan_id)
+        if self.folder is None:
+            return self.exchanged({}, (), oldest)
+        log = copy(self)
+        log._write([(self._end + i, scan_id, self._scans[scan_id]) for i, scan_id in enumerate(oldest)])
+        log._scans = {scan_id: scan for scan_id, scan in self._scans.items() if scan_id not in set(oldest)}
+        log.num_bytes = sum(scan.num_bytes for scan in log._scans.values())
+        return log
 
     def sealed_beyond(self, centre: Floats, radius_m: float) -> ScanLog:
         """Return a log with those scans sealed that have returns outside a ball around `centre` (3,), world, m."""
         sealed = []
-        for scan_id in self.ids:
-            scan = self.get(scan_id)
+        for scan_id, scan in self._scans.items():
             reach_m = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1).max())
             if np.linalg.norm(scan.pose[:3, 3] - centre) + reach_m > radius_m:
                 sealed.append(scan_id)

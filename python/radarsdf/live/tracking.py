@@ -133,6 +133,7 @@ class Follower:
     config: FitConfig
     num_radars: int = 1
     _judged: dict[Label | None, _Judged] = field(default_factory=dict)  # by label of a radar
+    _edits: int = 0  # of the log, when the poses were read
     _complete: bool = False  # False while the attributes below change, or if that was interrupted
     _steps: deque[Step] = field(init=False)
     _rates: deque[tuple[MotionRate, MotionRate]] = field(init=False)
@@ -248,7 +249,9 @@ class Follower:
 
     def _synchronise(self, track: Track, log: ScanLog) -> None:
         """Read the poses of the map: scans may have been added, moved or removed."""
-        steps = [now for step in track.steps if (now := _now(step, log)) is not None]
+        steps = [*track.steps]
+        if log.edits != self._edits:
+            steps = [now for step in steps if (now := _now(step, log)) is not None]
         new = next((more for more in (0, 1) if self._complete and self._continued_by(steps, more)), None)
         self._complete = False
         if new is None:
@@ -261,7 +264,7 @@ class Follower:
             now = _now(Step(scan_id, logged, self._velocity(logged), found), log)
             if now is not None and not (self._steps and now.time_s <= self._steps[-1].time_s):
                 self._add(now)
-        self._complete = True
+        self._complete, self._edits = True, log.edits
 
     def _continued_by(self, steps: list[Step], new: int) -> bool:
         """Whether steps are the present ones, without the oldest if there are too many, and `new` ones."""
@@ -357,7 +360,7 @@ class Follower:
     def _start(self, log: ScanLog, new: Step, sign: int) -> list[Step] | None:
         """Re-estimate the first scans by odometry, if due. None if the next scan can be registered with the previous ones."""
         steps = [*self._steps, new]
-        fixed = [i for i, step in enumerate(steps) if step.given or log.entry(step.scan_id) is None][:-1]
+        fixed = [i for i, step in enumerate(steps) if step.given or step.scan_id in log.sealed]
         first = max(fixed, default=0)
         moving = [i for i in range(first, len(steps)) if steps[i].moves]
         most = _START * self.num_radars
@@ -438,14 +441,14 @@ def _covariance(velocity: SensorVelocity) -> Floats:
 
 def _now(step: Step, log: ScanLog) -> Step | None:
     """Return a scan as it is in the map. None if it was removed. A sealed one cannot have changed."""
-    entry = log.entry(step.scan_id)
-    if entry is None:
-        return step if step.scan_id in log else None
-    if entry.pose is step.found.pose:
+    if step.scan_id in log.sealed:
         return step
-    if entry.time_s != step.logged.time_s:
-        return None  # another scan of this id
-    found = dataclasses.replace(step.found, pose=entry.pose, covariance=_GIVEN)
+    logged = log.find(step.scan_id)
+    if logged is None or logged.time_s != step.logged.time_s:  # another scan of this id
+        return None
+    if (logged.pose == step.found.pose).all():
+        return step
+    found = dataclasses.replace(step.found, pose=logged.pose, covariance=_GIVEN)
     return dataclasses.replace(step, found=found, given=True)
 
 

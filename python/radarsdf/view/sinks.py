@@ -170,10 +170,10 @@ class Ros2Sink(Sink):
         self._node, self._drive = node, drive
 
     def show_scan(self, scan: Scan, time_s: float) -> None:
-        frame, T_frame_sensor = self._drive.carriers[scan.sensor]
+        frame, T_frame_sensor, published = self._drive.carrier(scan.sensor)
         pose = self._pose(scan.T_world_sensor @ np.linalg.inv(T_frame_sensor))
         self._publish("/pose", "geometry_msgs/msg/PoseStamped", time_s, pose=pose)
-        if self._drive.broadcasts:
+        if self._drive.unposed and not published:  # a frame has one parent
             parts = {"translation": pose.position, "rotation": pose.orientation}
             moved = make_message("geometry_msgs/msg/Transform", **parts)
             one = {"header": self._header(time_s), "child_frame_id": frame, "transform": moved}
