@@ -139,7 +139,7 @@ def test_a_wrong_guess_is_refused(index, day):
 
 def test_a_guess_that_returns_do_not_confirm_is_not_sure(index, elsewhere):
     guess = moved(elsewhere.poses[0], np.array([30.0, 0, 0, 0, 0, 0]))
-    one = radarsdf.locate(index, elsewhere.points[:1], times_s=[0.0], guess=guess)
+    one = located(index, elsewhere, slice(1), guess=guess)
     for found in (located(index, elsewhere, guess=guess), one):
         assert any("guess" in note for note in found.report["notes"])
         assert (np.sqrt(np.einsum("fii->fi", found.covariance)[:, :2]) >= 0.5).all()

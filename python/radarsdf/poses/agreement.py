@@ -207,6 +207,8 @@ def sign_significance(
 ) -> tuple[float, Floats]:
     """Return the standard errors by which scans agree better with velocities than reversed, and the yaws (2, F - 1) for both."""
     durations_s, agreement = np.diff(times_s), of_neighbours(scans)
+    if len(scans) < 2:
+        return 0.0, np.zeros((2, 0))
     moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
     usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)

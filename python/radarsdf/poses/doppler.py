@@ -70,7 +70,8 @@ class SensorVelocities:
         mean, covariance, weak = upright(means, covariance)
         at = times_s[found]
         durations = np.diff(at)
-        usual = (durations > 0) & (durations <= 2 * np.median(durations))
+        longest_s = 2 * np.median(durations) if len(durations) else 0.0
+        usual = (durations > 0) & (durations <= longest_s)
         # Includes the noise of the velocities: an overestimate.
         squares = np.diff(mean[found], axis=0)[usual] ** 2
         change = squares.sum(axis=0) / max(durations[usual].sum(), 1e-9) + LEAST_MPS**2
