@@ -287,8 +287,9 @@ class ScanLog:
             return self.exchanged({}, (), oldest)
         log = copy(self)
         log._write([(self._end + i, scan_id, self._scans[scan_id]) for i, scan_id in enumerate(oldest)])
-        log._scans = {scan_id: scan for scan_id, scan in self._scans.items() if scan_id not in set(oldest)}
-        log.num_bytes = sum(scan.num_bytes for scan in log._scans.values())
+        log._scans = self._scans.copy()
+        for scan_id in oldest:
+            log.num_bytes -= log._scans.pop(scan_id).num_bytes
         return log
 
     def sealed_beyond(self, centre: Floats, radius_m: float) -> ScanLog:
