@@ -356,6 +356,3 @@ def test_areas_at_vertices_are_thirds_of_the_triangles():
     expected = np.zeros(len(mesh.vertices))
     np.add.at(expected, mesh.faces.ravel(), np.repeat(mesh.area_faces / 3, 3))
     np.testing.assert_allclose(found, expected)
-    for wrong in (-1, len(mesh.vertices)):
-        with pytest.raises(ValueError, match="vertex"):
-            vertex_areas(mesh.vertices.copy(), np.array([[0, 1, wrong]], np.int32))

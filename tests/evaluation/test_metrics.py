@@ -222,14 +222,6 @@ def test_the_number_of_neighbours_is_chosen_by_an_inner_hold_out():
     assert (knn.predict(points, sensors + 1) == whole.predict(points, sensors + 1)).all()
 
 
-def test_knn_with_few_returns():
-    one = KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0])
-    assert one.predict([[9.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [0.0, 0.0, 0.0]).tolist() == [55.0, 55.0]
-    assert one.predict(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
-    with pytest.raises(ValueError, match="viewing direction"):
-        one.predict([[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0])
-
-
 WHOLE = moved(np.eye(4)[None], np.array([[30.0, -20, 10, 0.4, -0.3, 2.1]]))[0]
 
 
@@ -263,15 +255,6 @@ def test_errors_of_a_too_sharp_turn_grow_with_the_segment_length():
     assert metrics["length_m"] == pytest.approx(100)
 
 
-def test_long_trajectories_have_kitti_segments():
-    true = np.tile(np.eye(4), (802, 1, 1))
-    true[:, 0, 3] = np.arange(802)
-    found = drifted(true, 0, 0, 0, yaw_rad=1e-5)
-    counts, angles = 802 - np.arange(100, 801, 100), 1e-5 * np.arange(100, 801, 100) / 2
-    ratio = trajectory_metrics(found, true, align="none")["relative_ratio"]
-    assert ratio == pytest.approx(counts @ angles / counts.sum(), rel=0.01)
-
-
 def test_errors_of_a_drift_are_root_mean_squares():
     true = trajectory(200)
     found = drifted(true, 0.03, 0.004, 7)
@@ -284,14 +267,6 @@ def test_errors_of_a_drift_are_root_mean_squares():
     brought = trajectory_metrics(WHOLE @ found, true)["absolute_m"]
     assert brought == pytest.approx(trajectory_metrics(found, true)["absolute_m"])
     assert brought < metrics["absolute_m"]
-
-
-def test_wrong_arguments_are_refused():
-    poses = trajectory(4)
-    with pytest.raises(ValueError, match="align"):
-        trajectory_metrics(poses, poses, align="scale")
-    with pytest.raises(ValueError, match="poses"):
-        trajectory_metrics(poses[:3], poses)
 
 
 def drawn(count=100_000, seed=0):
@@ -323,18 +298,6 @@ def test_uncertainties_wrong_by_a_factor_of_two(factor, ence):
     assert m["coverage_95"] == pytest.approx(math.erf(1.959964 / factor / math.sqrt(2)), abs=0.005)
 
 
-def test_bins_agree_with_a_plain_loop():
-    error_m, uncertainty_m = drawn(1003)
-    order = np.argsort(uncertainty_m)
-    predicted, measured = [], []
-    for rows in np.array_split(order, 10):
-        predicted.append(math.sqrt(sum(uncertainty_m[i] ** 2 for i in rows) / len(rows)))
-        measured.append(math.sqrt(sum(error_m[i] ** 2 for i in rows) / len(rows)))
-    m = uncertainty_metrics(error_m, uncertainty_m)
-    np.testing.assert_allclose(m["decile_predicted_m"], predicted)
-    np.testing.assert_allclose(m["decile_rmse_m"], measured)
-
-
 def test_perfect_confidences():
     rng = np.random.default_rng(0)
     confidence = rng.random(100_000)
@@ -354,11 +317,3 @@ def test_auc_agrees_with_all_pairs():
     a, b = confidence[truth][:, None], confidence[~truth]
     assert confidence_metrics(confidence, truth)["auc"] == pytest.approx(np.mean((a > b) + 0.5 * (a == b)))
     assert confidence_metrics(confidence, np.ones(200, bool))["auc"] is None
-
-
-def test_bins_of_few_points_are_ignored_by_the_maximum_gap():
-    confidence, truth = np.append(np.full(1000, 0.95), 0.05), np.append(np.arange(1000) >= 50, True)
-    m = confidence_metrics(confidence, truth)
-    assert m["worst_gap"] == pytest.approx(0, abs=1e-9)
-    assert m["bin_true_share"] == [1.0, *[None] * 8, pytest.approx(0.95)]
-    assert m["bin_count"] == [1, *[0] * 8, 1000]
