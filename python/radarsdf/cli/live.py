@@ -141,10 +141,13 @@ def live(given: Namespace, results: Results) -> None:
             check(timed, f"{given.scans}: scans without poses need times, one per scan")
             if trajectory is not None:
                 check_pose_times(trajectory, scans.times_s)
-        # Of the scans in the map, which hours of driving are many of, memory holds only the last ones. /tmp may be memory.
-        beside = None if out is None else out.absolute().parent
-        temporary = TemporaryDirectory(prefix="radarsdf-", dir=beside, ignore_cleanup_errors=True)
-        folder = servers.enter_context(temporary)
+        folder = None
+        if request is not None:
+            # Of the scans of hours of driving, memory holds only the last ones. /tmp may be memory.
+            beside = None if out is None else out.absolute().parent
+            folder = servers.enter_context(
+                TemporaryDirectory(prefix="radarsdf-", dir=beside, ignore_cleanup_errors=True)
+            )
         with deferred_interrupts() as stopped:
             if request is not None:
                 node = servers.enter_context(contextlib.closing(Node(given.ros2_domain, given.host)))
