@@ -196,17 +196,17 @@ class LiveMap:
             If there is no such scan, or it was sealed.
         """
         with self._lock:
-            found = self._state.log.find(scan_id)
+            found = self._state.log.placed(scan_id)
             if found is None:
                 raise KeyError(scan_id)
-            return found.pose.copy()
+            return found[0].copy()
 
     def trajectory(self) -> tuple[Floats, Floats]:
         """Return the times (F,), s, NaN where unknown, and the poses (F, 4, 4) of the scans of :attr:`scan_ids`."""
         with self._owned(changes=False):
-            known = [(scan.time_s, scan.pose) for scan in self._state.log.scans()]
-        times_s = np.array([np.nan if time_s is None else time_s for time_s, _ in known])
-        return times_s, np.array([pose for _, pose in known]).reshape(-1, 4, 4)
+            known = self._state.log.trajectory()
+        times_s = np.array([np.nan if time_s is None else time_s for *_, time_s in known])
+        return times_s, np.array([pose for _, pose, _ in known]).reshape(-1, 4, 4)
 
     def integrate(
         self,

@@ -118,7 +118,12 @@ class _Rows:
     """Rows of scans in a file, which never change: a change of the map adds others, so that it can be undone."""
 
     def __init__(self, folder: Path | None) -> None:
-        self._path = (folder or Path()) / _SCANS
+        self.folder = folder
+
+    @property
+    def _path(self) -> Path:
+        assert self.folder is not None
+        return self.folder / _SCANS
 
     @cached_property
     def _opened(self) -> sqlite3.Connection:
@@ -182,41 +187,56 @@ class ScanLog:
     def __contains__(self, scan_id: ScanId) -> bool:
         return scan_id in self._scans or scan_id in self.sealed or self._row(scan_id) is not None
 
-    def _row(self, scan_id: ScanId) -> tuple[int, int] | None:
-        """Return the numbers of the row of a scan in the folder, and of its place in order; None if there is none."""
+    def _row(self, scan_id: ScanId) -> tuple[int, int, bytes, float | None] | None:
+        """Return number, place in order, pose and time of the row of a scan in the folder; None if there is none."""
         if not self._stored or scan_id in self._scans:
             return None
-        rows = self._rows.read("number, place FROM scans WHERE id = ? AND number < ?", scan_id, self._end)
-        return next(((number, place) for number, place in rows if number not in self._gone), None)
+        columns = "number, place, pose, time_s FROM scans WHERE id = ? AND number < ?"
+        rows = self._rows.read(columns, scan_id, self._end)
+        return next((row for row in rows if row[0] not in self._gone), None)
 
     @property
     def ids(self) -> list[ScanId]:
         """Identifiers of the scans that can be removed."""
-        if not self._stored:
-            return [*self._scans]
-        stored = self._rows.read("id, number FROM scans WHERE number < ? ORDER BY place", self._end)
-        return [*(scan_id for scan_id, number in stored if number not in self._gone), *self._scans]
+        return [scan_id for scan_id, *_ in self.trajectory()]
 
-    def find(self, scan_id: ScanId) -> LoggedScan | None:
-        """Return a scan. None if it cannot be removed."""
+    def trajectory(self) -> list[tuple[ScanId, Floats, float | None]]:
+        """Return id, pose (4, 4) and time, s, of the scans that can be removed, in order, without reading their returns."""
+        columns = "number, id, pose, time_s FROM scans WHERE number < ? ORDER BY place"
+        stored = self._rows.read(columns, self._end) if self._stored else []
+        stored = [row for row in stored if row[0] not in self._gone]
+        return [
+            *((scan_id, _pose_of(pose), time_s) for _, scan_id, pose, time_s in stored),
+            *((scan_id, scan.pose, scan.time_s) for scan_id, scan in self._scans.items()),
+        ]
+
+    def placed(self, scan_id: ScanId) -> tuple[Floats, float | None] | None:
+        """Return pose (4, 4) and time, s, of a scan, without reading its returns. None if it cannot be removed."""
+        row, held = self._row(scan_id), self._scans.get(scan_id)
+        if row is not None:
+            return _pose_of(row[2]), row[3]
+        return None if held is None else (held.pose, held.time_s)
+
+    def _find(self, scan_id: ScanId) -> LoggedScan | None:
         row = self._row(scan_id)
         if row is None:
             return self._scans.get(scan_id)
-        columns = f"pose, time_s, radar, {', '.join(_KINDS)} FROM scans WHERE number = ?"
-        ((pose, time_s, radar, *blobs),) = self._rows.read(columns, row[0])
+        number, _, pose, time_s = row
+        columns = f"radar, {', '.join(_KINDS)} FROM scans WHERE number = ?"
+        ((radar, *blobs),) = self._rows.read(columns, number)
         arrays = [
             None if blob is None else np.frombuffer(blob, chr(blob[0]), offset=1).copy() for blob in blobs
         ]
         held: dict[str, Any] = dict(zip(_KINDS, arrays, strict=True))
         held["points"] = held["points"].reshape(-1, 3)
         mounted = None if radar is None else self._radars[radar]
-        return LoggedScan(np.frombuffer(pose).reshape(4, 4).copy(), **held, time_s=time_s, radar=mounted)
+        return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted)
 
     def get(self, scan_id: ScanId) -> LoggedScan:
         """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
         sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
         check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
-        found = self.find(scan_id)
+        found = self._find(scan_id)
         if found is None:
             msg = f"the map has no scan {scan_id!r}"
             raise KeyError(msg)
@@ -243,12 +263,12 @@ class ScanLog:
         if sealed:
             log.sealed = self.sealed | sealed
         stored = {scan_id: row for scan_id in old if (row := self._row(scan_id)) is not None}
-        log._gone = self._gone.union(number for number, _ in stored.values())
+        log._gone = self._gone.union(number for number, *_ in stored.values())
         log._stored -= len(stored)
         for scan_id in (old | sealed) - new.keys() - stored.keys():
             log.num_bytes -= log._scans.pop(scan_id).num_bytes
         log._write(
-            [(place, scan_id, new[scan_id]) for scan_id, (_, place) in stored.items() if scan_id in new]
+            [(place, scan_id, new[scan_id]) for scan_id, (_, place, *_) in stored.items() if scan_id in new]
         )
         for scan_id in new.keys() - stored.keys():
             log.put(scan_id, new[scan_id])
@@ -300,6 +320,10 @@ class ScanLog:
             if np.linalg.norm(scan.pose[:3, 3] - centre) + reach_m > radius_m:
                 sealed.append(scan_id)
         return self.exchanged({}, (), sealed)
+
+
+def _pose_of(blob: bytes) -> Floats:
+    return np.frombuffer(blob).reshape(4, 4).copy()
 
 
 class RegionStore:

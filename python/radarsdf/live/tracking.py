@@ -443,12 +443,12 @@ def _now(step: Step, log: ScanLog) -> Step | None:
     """Return a scan as it is in the map. None if it was removed. A sealed one cannot have changed."""
     if step.scan_id in log.sealed:
         return step
-    logged = log.find(step.scan_id)
-    if logged is None or logged.time_s != step.logged.time_s:  # another scan of this id
+    placed = log.placed(step.scan_id)
+    if placed is None or placed[1] != step.logged.time_s:  # another scan of this id
         return None
-    if (logged.pose == step.found.pose).all():
+    if (placed[0] == step.found.pose).all():
         return step
-    found = dataclasses.replace(step.found, pose=logged.pose, covariance=_GIVEN)
+    found = dataclasses.replace(step.found, pose=placed[0], covariance=_GIVEN)
     return dataclasses.replace(step, found=found, given=True)
 
 
