@@ -35,7 +35,7 @@ def test_scans_at_poses_of_the_body_are_those_of_a_fit(scans, tmp_path):
     fitted = radarsdf.fit(chosen, config=config)
     vertices = fitted.mesh(0.2).vertices
     np.testing.assert_array_equal(live.finish().mesh(0.2).vertices, vertices)
-    # Poses of the radars are rounded otherwise. In the unit of another radar, intensities would be off by 6 dB.
+    # Poses of the radars are rounded otherwise. In the unit of another radar, intensities would have errors of 6 dB.
     seen = [of.intensity(vertices, scans.poses[0, :3, 3], sensor="rear") for of in (live.map(), fitted)]
     assert np.nanmax(np.abs(seen[0] - seen[1])) < 0.1
     assert np.nanmax(np.abs(live.map().sdf(vertices))) < 1e-3

@@ -122,10 +122,7 @@ def fit(
         static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns, rig)
         options = config.preparation | {"num_threads": resolve_num_threads(config.num_threads)}
         rays = prepare(static.points, poses_, static.intensities, origin=origin, rig=rig, **options)
-        radars = None
-        if rig is not None:
-            radars = Radars.of(rays, rig.labels, config, options["num_threads"])
-            rays = radars.in_one_unit(rays)
+        rays, radars = Radars.unify(rays, rig, config, options["num_threads"])
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
             scale = IntensityScale.between(intensity_range)

@@ -229,12 +229,9 @@ class GrowingState:
             rays = _rays_of(scans, self.config, origin).without_outliers()
             poses = np.stack([scan.T_world_sensor for scan in scans])
             moving = sum(int((~scan.is_static).sum()) for scan in scans if scan.is_static is not None)
-            radars, rig = None, rig_of_scans(scans)
-            if rig is not None:
-                radars = Radars.of(rays, rig.labels, self.config, self._num_threads)
-                rays = radars.in_one_unit(rays)
+            rays, radars = Radars.unify(rays, rig_of_scans(scans), self.config, self._num_threads)
             # The sums do not weight returns by the noise of their radars, but have those of all scans.
-            used = sums if rig is None or is_part else None
+            used = sums if radars is None or is_part else None
             scale = IntensityScale.of(rays.intensities)
             return FitInput(rays, scale, poses, moving, sums=used, radars=radars, visibility=visibility)
 

@@ -21,7 +21,7 @@ from radarsdf.returns.noise import RigNoise, SensorNoise, rig_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.reflectance import of_views, regression
-from radarsdf.rig import Label
+from radarsdf.rig import Label, Rig
 
 # Quantile of azimuth, elevation and range at either end, beyond which returns count as outliers.
 _STRAY = 0.002
@@ -31,6 +31,10 @@ _WEAKEST = 0.01  # quantile of the intensities in a range bin that is the thresh
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))  # of a normal distribution, standard deviations
 _MAX_RANGE_M = 1e6
 _Intensities = TypeVar("_Intensities", Floats, Floats32)
+
+Unit = tuple[float, float]
+"""Gain and offset of a radar's intensities: gain · intensity of the map + offset."""
+SAME_UNIT: Unit = (1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class Sensor:
     thresholds: tuple[tuple[float, float], ...] = ()
     """Pairs of a range, m, ascending, and the weakest intensity detected there, sensor units, interpolated
     linearly. Empty: the sensor measures no intensities."""
-    unit: tuple[float, float] = (1.0, 0.0)
+    unit: Unit = SAME_UNIT
     """Gain and offset: it measures gain · intensity + offset where the map, in the unit of its first radar, has an intensity."""
 
     def __post_init__(self) -> None:
@@ -99,7 +103,7 @@ class Sensor:
     def measured(self, intensities: _Intensities) -> _Intensities:
         """Convert intensities (N,) of a map to the :attr:`unit` of this sensor."""
         gain, offset = self.unit
-        return intensities if self.unit == (1.0, 0.0) else gain * intensities + offset
+        return intensities if self.unit == SAME_UNIT else gain * intensities + offset
 
     def directions(self, azimuth_rad: Array, elevation_rad: Array) -> Floats:
         """Convert azimuths and elevations (N,), rad, to unit vectors (N, 3), float64, in the sensor frame."""
@@ -111,7 +115,7 @@ class Sensor:
         """Convert to a dict that JSON can store. :meth:`from_dict` is the inverse."""
         described = dataclasses.asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
         unit = described.pop("unit")
-        return described if unit == (1.0, 0.0) else described | {"unit": list(unit)}
+        return described if unit == SAME_UNIT else described | {"unit": list(unit)}
 
     @classmethod
     def from_dict(cls, described: dict[str, Any]) -> Sensor:
@@ -190,13 +194,16 @@ def _thresholds(ranges_m: Floats, intensities: Floats) -> tuple[tuple[float, flo
     return tuple(sorted({float(range_m): float(weakest) for range_m, weakest in of_bins}.items()))
 
 
-Unit = tuple[float, float]
-"""Gain and offset of a radar's intensities: gain · intensity of the map + offset."""
-
 _MOST_RETURNS = 60_000  # sample size
 _FEWEST_SHARED = 30  # surfels that a radar shares with others, for its offset
 # Measured on simulated rigs in dB: the spreads of two radars differ by a factor of 0.70 to 1.15.
-_SAME_UNIT = 1.6
+_SAME_SPREAD = 1.6
+
+
+def in_map_unit(intensities: _Intensities, unit: Unit) -> _Intensities:
+    """Convert intensities (N,) of a radar to the unit of the map: the inverse of :meth:`Sensor.measured`."""
+    gain, offset = unit
+    return (intensities - offset) / gain
 
 
 @dataclass(frozen=True)
@@ -215,14 +222,23 @@ class Radars:
         noise = rig_noise(surfels, rays, config.returns, num_threads)
         return cls(labels, noise, intensity_units(surfels, rays, num_threads))
 
+    @classmethod
+    def unify(
+        cls, rays: Rays, rig: Rig | None, config: FitConfig, num_threads: int = 0
+    ) -> tuple[Rays, Radars | None]:
+        """Estimate the radars of a rig, and return `rays` in one unit, and them; of one radar as they are, and None."""
+        if rig is None:
+            return rays, None
+        radars = cls.of(rays, rig.labels, config, num_threads)
+        return radars.in_one_unit(rays), radars
+
     def in_one_unit(self, rays: Rays) -> Rays:
         """Return `rays` with the intensities of all radars in the unit of the first. Without a unit they stay."""
         if rays.intensities is None:
             return rays
         values = rays.intensities.copy()
         for unit, rows in zip(self.units, rays.rows_of_sensors(), strict=True):
-            gain, offset = unit or (1.0, 0.0)
-            values[rows] = (values[rows] - offset) / gain
+            values[rows] = in_map_unit(values[rows], unit or SAME_UNIT)
         return dataclasses.replace(rays, intensities=values)
 
     def sensors(self, rays: Rays, poses: ArrayLike) -> dict[Label, Sensor]:
@@ -231,7 +247,7 @@ class Radars:
         each = zip(self.labels, self.noise.of_sensors, self.units, rays.rows_of_sensors(), strict=True)
         for label, noise, unit, rows in each:
             if len(own := rays.select(rows)):
-                sensor, (gain, offset) = Sensor.of_rays(own, poses, noise), unit or (1.0, 0.0)
+                sensor, (gain, offset) = Sensor.of_rays(own, poses, noise), unit or SAME_UNIT
                 thresholds = tuple((range_m, gain * low + offset) for range_m, low in sensor.thresholds)
                 found[label] = dataclasses.replace(sensor, thresholds=thresholds, unit=(gain, offset))
         return found
@@ -264,7 +280,7 @@ def intensity_units(surfels: Surfels, rays: Rays, num_threads: int = 0) -> tuple
     assert rays.sensor_of_scan is not None
     views = of_views(rays.directions, rays.ranges_m, surfels.normals, plane)
     sensors, values = rays.sensor_of_scan[rays.scans], rays.intensities.astype(np.float64)
-    units[int(sensors.min())] = (1.0, 0.0)
+    units[int(sensors.min())] = SAME_UNIT
     # Surfels with returns at the limits of a radar, which may be clipped: saturated ones have no differences.
     clipped = np.zeros(len(surfels.normals), np.bool_)
     for rows in rays.rows_of_sensors():
@@ -281,8 +297,8 @@ def intensity_units(surfels: Surfels, rays: Rays, num_threads: int = 0) -> tuple
             return tuple(units)
         own = sensors == new
         both = np.flatnonzero(shared[new][plane] & (own | known[sensors]))
-        units[new] = gain, offset = _unit(values[both], own[both], plane[both], views[both])
-        values[own] = (values[own] - offset) / gain
+        units[new] = unit = _unit(values[both], own[both], plane[both], views[both])
+        values[own] = in_map_unit(values[own], unit)
 
 
 def _unit(values: Floats, own: Bools, plane: Ints, views: Floats) -> Unit:
@@ -292,7 +308,7 @@ def _unit(values: Floats, own: Bools, plane: Ints, views: Floats) -> Unit:
     """
     spread, other_spread = (_effects(values[rows], views[rows], plane[rows])[1] for rows in (own, ~own))
     gain = spread / other_spread if min(spread, other_spread) > 0 else 1.0
-    gain = gain if abs(np.log(gain)) > np.log(_SAME_UNIT) else 1.0
+    gain = gain if abs(np.log(gain)) > np.log(_SAME_SPREAD) else 1.0
     values = np.where(own, values / gain, values)
     return gain, gain * float(_effects(values, np.column_stack([views, own]), plane)[0][-1])
 

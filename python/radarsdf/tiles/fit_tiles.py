@@ -169,6 +169,8 @@ def fit_tile(folder: str, name: str) -> None:
 
     def read() -> FitInput:
         rays, inside = read_rays(root, plan, tile)
+        radars = plan.radars_of(rays)
+        rays = rays if radars is None else radars.in_one_unit(rays)
         limits = plan.intensity_range
         scale = None if limits is None else IntensityScale.between(limits)
         return FitInput(
@@ -180,7 +182,7 @@ def fit_tile(folder: str, name: str) -> None:
             sensor=plan.sensor,
             sensors=plan.sensors,
             box_cells=plan.box_cells(tile.tile),
-            radars=plan.radars_of(rays),
+            radars=radars,
         )
 
     radar_map = fit_rays(read, plan.config, progress=False)

@@ -25,7 +25,7 @@ from radarsdf.io.tensors import open_tensors
 from radarsdf.map.storage import checked_report
 from radarsdf.returns.noise import RigNoise
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sensor import Radars, Sensor
+from radarsdf.returns.sensor import Radars, Sensor, in_map_unit
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.rig import Label
 from radarsdf.settings import by_name, settings
@@ -174,9 +174,12 @@ class Plan:
     @property
     def intensity_range(self) -> tuple[float, float] | None:
         """Range of the intensities without outliers, in one unit. None: there are none."""
-        ends = [radar.intensity_range + radar.sensor.unit for radar in self.radars if radar.intensity_range]
-        scaled = [((low - offset) / gain, (high - offset) / gain) for low, high, gain, offset in ends]
-        return (min(low for low, _ in scaled), max(high for _, high in scaled)) if scaled else None
+        ends = [
+            in_map_unit(np.array(radar.intensity_range), radar.sensor.unit)
+            for radar in self.radars
+            if radar.intensity_range
+        ]
+        return (float(np.min(ends)), float(np.max(ends))) if ends else None
 
     @property
     def sensors(self) -> dict[Label, Sensor]:

@@ -26,7 +26,7 @@ from radarsdf.returns.moving import StaticReturns
 from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
-from radarsdf.returns.sensor import Sensor, Unit, intensity_units
+from radarsdf.returns.sensor import SAME_UNIT, Sensor, Unit, in_map_unit, intensity_units
 from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label
 from radarsdf.scans import Scan, scans_in_memory
@@ -42,7 +42,6 @@ _CHUNK_RETURNS = 500_000  # returns in memory at a time: fewer scans of a dense 
 _CHUNK_M = 1000.0  # scans of a chunk share a local frame, in which float32 must be precise
 _SENSOR_SCANS = 512  # largest sample of scans for the sensor model
 _SAMPLED_TILES = 4  # tiles that estimate noise, units and clutter ratio
-_SAME: Unit = (1.0, 0.0)
 
 
 class ScanStream:
@@ -189,7 +188,7 @@ class _Planner:
         radars = [
             RadarPlan(
                 label=label if label is None or isinstance(label, (int, str)) else str(label),
-                sensor=self._sensor([(own, _SAME)]),
+                sensor=self._sensor([(own, SAME_UNIT)]),
                 intensity_range=self._intensity_range(own, tiles, axes[:, 6] == i),
             )
             for i, (label, own) in enumerate(self._radars.items())
@@ -248,7 +247,7 @@ class _Planner:
                     of_radars.append(rig.of_sensors)
                     noises.append(rig.mean)
                 else:
-                    units.append((_SAME,))
+                    units.append((SAME_UNIT,))
                     noises.append(sensor_noise(*of_rays))
                     of_radars.append((noises[-1],))
             clutter += surfels.clutter_ratio() * len(rays)
@@ -268,7 +267,9 @@ class _Planner:
         for radar, own, unit in zip(plan.radars, of_radar, same_unit, strict=True):
             model = dataclasses.replace(radar.sensor, noise=own, unit=unit)
             radars.append(dataclasses.replace(radar, sensor=model))
-        sensor = self._sensor(zip(self._radars.values(), same_unit, strict=True))
+        sensor = plan.sensor
+        if plan.sensors:
+            sensor = self._sensor(zip(self._radars.values(), same_unit, strict=True))
         return dataclasses.replace(
             plan,
             config=plan.config.override(returns=noise.settings),
@@ -281,20 +282,20 @@ class _Planner:
     def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
         """Estimate a sensor without noise from the samples of radars, with the intensities in one unit."""
         points, values = [], []
-        for own, (gain, offset) in radars:
+        for own, unit in radars:
             for _, scan in own.samples:
                 points.append(scan.points)
                 if scan.intensities is not None:
-                    values.append((np.asarray(scan.intensities) - offset) / gain)
+                    values.append(in_map_unit(np.asarray(scan.intensities), unit))
         limits = {name: getattr(self._config.returns, name) for name in ("min_range_m", "max_range_m")}
         return Sensor.of(points, values or None, **limits)
 
 
 def _median_units(of_tiles: list[tuple[Unit | None, ...]]) -> list[Unit]:
-    """Medians of the units of each radar, of the tiles in which they are relative to the first radar; `_SAME` without any."""
-    alike = [units for units in of_tiles if units[0] == _SAME] or of_tiles[:1]
+    """Medians of the units of each radar, of the tiles in which they are relative to the first radar; `SAME_UNIT` without any."""
+    alike = [units for units in of_tiles if units[0] == SAME_UNIT] or of_tiles[:1]
     each = ([unit for unit in of_radar if unit is not None] for of_radar in zip(*alike, strict=True))
-    return [tuple(np.median(units or [_SAME], axis=0).tolist()) for units in each]
+    return [tuple(np.median(units or [SAME_UNIT], axis=0).tolist()) for units in each]
 
 
 def rays_path(folder: Path, tile: Tile) -> Path:
@@ -302,7 +303,7 @@ def rays_path(folder: Path, tile: Tile) -> Path:
 
 
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
-    """Rays that cross a tile, in the frame of its map, and the mask (N,) of returns in it or its halo."""
+    """Rays that cross a tile, in the frame of its map, intensities in the units of their radars; and the mask (N,) of returns in it or its halo."""
     path = rays_path(folder, tile.tile)
     whole = path.exists() and path.stat().st_size == tile.rays * _RECORD.itemsize
     wrong = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean"
@@ -322,9 +323,7 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
         values = np.full(len(rows), np.nan, np.float32)
         for radar, own in zip(plan.radars, rays.rows_of_sensors(), strict=True):
             if radar.intensity_range is not None:
-                gain, offset = radar.sensor.unit
-                kept = Plausible(*radar.intensity_range).kept(rows["intensity"][own])
-                values[own] = (kept - np.float32(offset)) / np.float32(gain)
+                values[own] = Plausible(*radar.intensity_range).kept(rows["intensity"][own])
         rays = dataclasses.replace(rays, intensities=values)
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
     halo = round(plan.halo_m / plan.config.leaf_size_m)
