@@ -42,7 +42,7 @@ left = radarsdf.calibrate(scans(rough)).mountings["left"]
 for name, mounting in (("rough", rough), ("calibrated", left.T_body_sensor)):
     turned = Rotation.from_matrix(mounting[:3, :3].T @ true[:3, :3]).magnitude()
     off = np.linalg.norm(mounting[:3, 3] - true[:3, 3])
-    print(f"{name}: off by {np.degrees(turned):.2f} degrees and {off:.3f} m")
+    print(f"{name}: errors of {np.degrees(turned):.2f} degrees and {off:.3f} m")
 print("standard deviations:", np.sqrt(left.covariance.diagonal()).round(4), "m, rad")
 
 # %%

@@ -201,9 +201,8 @@ _CONCENTRATED = 1.25
 _SURE = 5.0  # log likelihood ratio of a fault to drift: below, it is undecided
 _LEAST_STEPS = 8  # that a fault explains
 _LEAST_ERROR = 1e-6  # of a step, m
-_NEAR_PAIRS = (
-    17  # pairs whose median score is the usual one: scenes overlap more in some places than in others
-)
+# Pairs whose median score is the usual one: scenes overlap more in some places than in others.
+_NEAR_PAIRS = 17
 _MOST_CUTS = 10
 # Of the best of some hundred exchanges. Measured: 14 and more for exchanges, 4 on a handheld radar with dead reckoning.
 _EXCHANGE_GAIN, _EXCHANGE_SIGNIFICANCE = 0.05, 8.0

@@ -144,9 +144,9 @@ def live(given: Namespace, results: Results) -> None:
         folder = None
         if request is not None:
             # Of the scans of hours of driving, memory holds only the last ones. /tmp may be memory.
-            beside = None if out is None else out.absolute().parent
+            parent = None if out is None else out.absolute().parent
             folder = servers.enter_context(
-                TemporaryDirectory(prefix="radarsdf-", dir=beside, ignore_cleanup_errors=True)
+                TemporaryDirectory(prefix="radarsdf-", dir=parent, ignore_cleanup_errors=True)
             )
         with deferred_interrupts() as stopped:
             if request is not None:

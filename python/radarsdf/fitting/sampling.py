@@ -48,9 +48,8 @@ class Batch:
     points: Floats32  # (B, 3) local frame, m
     sdf_m: Floats32  # (B,) label: distance along the ray to the return, m, positive in front of it
     of_ray: Floats32  # (B, 7 or 8) return (3), local, m; direction (3); range, m; optionally scaled intensity
-    parts: list[
-        tuple[int, int]
-    ]  # numbers of samples and of leading samples with intensity labels of each part
+    parts: list[tuple[int, int]]
+    """Numbers of samples and of leading samples with intensity labels of each part."""
 
 
 class RaySampler:

@@ -196,7 +196,7 @@ class _Unlogged(Notes):
 
 
 class _Known(NamedTuple):
-    """What the poses received so far tell."""
+    """What is derived from the poses received so far."""
 
     tree: TransformTree
     topic: Track | None  # of the poses, if they are those of a topic
@@ -353,7 +353,7 @@ class Subscription:
         self._poses = _Poses(request)
         self._frames = self._poses.frames
         self._listener = _Listener(node, self._topics, request, self._poses, stopped)
-        self.unposed, self._why = find, ""
+        self.unposed = find
         self._await_poses()
         self._assumed = self._is_assumed()
         known, mounted = self._poses.known(), self._mounted()
@@ -425,8 +425,7 @@ class Subscription:
 
     def _await_poses(self) -> None:
         """Wait until poses of the scans are known, or that there are none; after a while, report for what."""
-        begin_s, late_s = time.monotonic(), np.inf
-        report_s = begin_s + 1.5 * _PATIENCE_S
+        late_s, report_s = np.inf, time.monotonic() + 1.5 * _PATIENCE_S
         while not self._stopped():
             missing = [topic for topic in self._topics if topic not in self._frames]
             why = f"messages of {', '.join(missing)}"

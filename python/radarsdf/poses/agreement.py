@@ -33,10 +33,8 @@ LAGS = (1, 2, 4, 8)
 """Lags between the scans of a pair; multiplied by a stride if the sensor is slow."""
 _MOTION = 0.05  # share of the median range: smaller motions hardly show errors of the poses
 
-_SAMPLED, _PAIRS = (
-    200,
-    40,
-)  # returns of a scan, and pairs of neighbouring scans, that determine the sign of the Doppler
+# Returns of a scan, and pairs of neighbouring scans, that determine the sign of the Doppler.
+_SAMPLED, _PAIRS = 200, 40
 _FIRST_PAIRS = 12
 _FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
 YAW_STEP_RAD = 0.07

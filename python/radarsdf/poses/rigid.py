@@ -116,10 +116,8 @@ def assembled(matrix: Floats, translation: Floats | float = 0.0) -> Floats:
 def rotation_vector(matrix: Floats, near: Floats | None = None) -> Floats:
     """Convert rotations (..., 3, 3) to the rotation vectors (..., 3), rad, nearest to `near`, or to 0, up to whole turns."""
     axial = 0.5 * (matrix - matrix.swapaxes(-1, -2))[..., [2, 0, 1], [1, 2, 0]]
-    sine, cosine = (
-        np.sqrt((axial**2).sum(axis=-1, keepdims=True)),
-        0.5 * (np.trace(matrix, axis1=-2, axis2=-1) - 1),
-    )
+    sine = np.sqrt((axial**2).sum(axis=-1, keepdims=True))
+    cosine = 0.5 * (np.trace(matrix, axis1=-2, axis2=-1) - 1)
     if np.all(cosine > 0):  # much faster than Rotation, which tests that the matrix is one
         found = axial * (np.arctan2(sine, cosine[..., None]) / np.maximum(sine, 1e-300))
     else:
