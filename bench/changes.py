@@ -7,8 +7,6 @@ change their reflectance return 6 dB more or less in the second drive; recall is
 Holes are cubes on raised surfaces whose returns in every second scan are extended by 8 m; recall is the share of area that is gone.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import itertools

@@ -1,7 +1,5 @@
 """Data shared by benchmarks, fixed by seeds, with memory accesses as in a real fit."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Memory and time of fits compared with their estimates: `python -m bench.estimates memory|durations`, on Linux."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from typing import Any

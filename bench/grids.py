@@ -4,8 +4,6 @@ A place is a point on a true surface that the radar can detect from one of its p
 middle of the path. Distances of free voxels are compared with the true distances from their centres.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ Load on the machine does not change counts. Two checks end with an error: the co
 ``instructions.json`` lists for this compiler and instruction set; or a step depends on the number of returns, on any machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import itertools

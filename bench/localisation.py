@@ -14,8 +14,6 @@ true pose, displaced by 2 m and turned by 10°.
     pip install --no-deps kiss-matcher==1.0.2 map-closures==2.2.0 small-gicp==1.0.1
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import itertools

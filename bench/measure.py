@@ -1,7 +1,5 @@
 """Time and memory of a block, and functions in new processes. Standard library only: a peer's Python may be old."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import json

@@ -3,8 +3,6 @@
 The radars of `scenes/rigs.py` repeat the drive of each scene. The motorway is a file of front and rear radar, passed as a case.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import itertools

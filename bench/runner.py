@@ -3,8 +3,6 @@
 Rows are printed as they come, and written as JSON with everything needed to repeat them, and as Markdown tables.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import platform

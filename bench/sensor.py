@@ -3,8 +3,6 @@
 `python -m bench.sensor FILE.npz ...`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

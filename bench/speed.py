@@ -4,8 +4,6 @@ PATH is a wheel, or a checkout built in place. Ratios within a round are of cons
 machine affects both.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools

@@ -1,7 +1,5 @@
 """Times fits of any version of radarsdf: a program of its own for `bench.speed`, that uses only its public functions."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -4,8 +4,6 @@ Each case checks its result against NumPy in double precision, so that a wrong r
 only times of one group and one run, not those of different runs or machines: see README.md.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 

@@ -1,7 +1,5 @@
 """Query times of fitted maps near their returns, next to distances to their mesh by Open3D, and times of meshes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

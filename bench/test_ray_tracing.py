@@ -4,8 +4,6 @@ The extra information lists rays per second. Each case checks that most rays end
 that a wrong result cannot be fast.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

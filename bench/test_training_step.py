@@ -4,8 +4,6 @@ There is a group per stage of the schedule: geometry alone, geometry and intensi
 frozen geometry. All cases of a group run as many steps per round, so that times can be compared.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Maps in tiles compared with one fit, and their scaling with returns: `python -m bench.tiles seams|growth`, on Linux."""
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import resource

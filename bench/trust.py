@@ -5,8 +5,6 @@
 Right: within 4 of its own standard deviations from the middle scan, or within 5 % of the path for poses without deviations.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import time

@@ -1,7 +1,5 @@
 """Distances of a mesh from the true surface: from simulated solids exactly, from lidar points by planes."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Draw the figures of how_it_works.md: ``python docs/draw.py`` writes them to docs/figures. It needs the extra `plot`."""
 
-from __future__ import annotations
-
 import argparse
 import io
 from pathlib import Path

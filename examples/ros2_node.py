@@ -5,8 +5,6 @@
 Without an own node: `radarsdf live --ros2 /radar/points`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import radarsdf
 import rclpy

@@ -1,7 +1,5 @@
 """Scenes of many kinds, each with another radar and drive, so that results do not depend on one scene."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial

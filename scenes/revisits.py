@@ -1,7 +1,5 @@
 """Places visited again: another day's drive, sessions that overlap, and places that look alike in several positions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Rigs of three radars on the drives of simulated scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

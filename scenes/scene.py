@@ -1,7 +1,5 @@
 """Scenes of experiments and tests of quality: simulated ones, and recorded ones from files and folders."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,31 +109,31 @@ class Scene:
         used: NDArray[np.bool_] = (range_m >= self.min_range_m) & (range_m <= (self.max_range_m or np.inf))
         return used
 
-    def every_nth(self, n: int) -> Scene:
+    def every_nth(self, n: int) -> "Scene":
         """The scans 0, n, 2n, … with the whole ground truth."""
         return self._select(np.arange(0, len(self), n))
 
-    def first(self, n: int) -> Scene:
+    def first(self, n: int) -> "Scene":
         """The first `n` scans with the whole ground truth."""
         return self._select(np.arange(n))
 
-    def repeated(self, repetition: int) -> Scene:
+    def repeated(self, repetition: int) -> "Scene":
         """The simulated scene with another seed, since fits with other seeds repeat most errors; a recorded one unchanged."""
         if self.simulation is None or repetition == 0:
             return self
         other = load_scene(self.name, frames=len(self), seed=self.simulation.seed + repetition)
         return dataclasses.replace(other, box=self.box)
 
-    def without_intensities(self) -> Scene:
+    def without_intensities(self) -> "Scene":
         """The scene without intensities."""
         return dataclasses.replace(self, intensities=None)
 
-    def split(self) -> tuple[Scene, Scene]:
+    def split(self) -> "tuple[Scene, Scene]":
         """The scans to fit, and the held-out scans; see `holdout_every`."""
         train, test = holdout(len(self), self.holdout_every)
         return self._select(train), self._select(test)
 
-    def _select(self, frames: NDArray[np.int64]) -> Scene:
+    def _select(self, frames: NDArray[np.int64]) -> "Scene":
         scans = Scans(
             self.points, self.poses, self.intensities, doppler_mps=self.doppler_mps, times_s=self.times_s
         ).select(frames)

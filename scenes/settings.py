@@ -1,7 +1,5 @@
 """Presets by name, and changes of their settings as nested dicts."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterable
 from typing import Any

@@ -1,7 +1,5 @@
 """Small analytic scenes shared by several tests."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

@@ -1,7 +1,5 @@
 """Small valid files of every format, and headers of NumPy that claim any shape."""
 
-from __future__ import annotations
-
 import functools
 import io
 import tempfile

@@ -1,7 +1,5 @@
 """Settings by name without groups, for tests that vary single ones."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

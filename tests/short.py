@@ -1,7 +1,5 @@
 """Short fits and drives for pages, which test text and files, not quality."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

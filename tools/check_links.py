@@ -4,8 +4,6 @@ Links within it must lead to a file, and to an anchor that is there. Links that 
 https addresses of the hosts below, since a test has no network to try them.
 """
 
-from __future__ import annotations
-
 import sys
 from html.parser import HTMLParser
 from pathlib import Path

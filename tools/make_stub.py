@@ -6,8 +6,6 @@ Needs the package importable and the `dev` extra: the versions of pybind11, pybi
 signature looks like, so they are pinned there.
 """
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import re

@@ -9,8 +9,6 @@ with its line: a test is missing, or the line says the same as before. The work 
 folder. With ``--core``, each fault is compiled there, and the C++ tests, which need doctest, and ``tests/core`` run, too.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import os

@@ -6,8 +6,6 @@
 Python, C++ and templates are counted in lines, documents in words.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

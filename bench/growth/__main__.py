@@ -1,7 +1,5 @@
 """Growth of time and memory: `python -m bench.growth fits|surfels|poses`, on Linux."""
 
-from __future__ import annotations
-
 from bench.growth import fits
 from bench.runner import Experiment, main
 

@@ -1,7 +1,5 @@
 """Time and memory of fits, of their stages, and of pose refinement. Each row is measured in a new process, on Linux."""
 
-from __future__ import annotations
-
 import argparse
 import itertools
 from collections.abc import Iterator

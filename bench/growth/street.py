@@ -6,8 +6,6 @@ intensity in dB follows the radar equation: it falls with the fourth power of th
 the walls.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

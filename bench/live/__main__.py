@@ -1,7 +1,5 @@
 """Live maps: `python -m bench.live EXPERIMENT`."""
 
-from __future__ import annotations
-
 from bench.live import accuracy, removal, speed
 from bench.runner import Experiment, main
 

@@ -1,7 +1,5 @@
 """Surface and intensities of live maps, compared with fits of the same scans."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Removal and correction of scans in random order: bits and time."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Time and memory of live maps and of odometry. Times are CPU times unless stated."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import resource

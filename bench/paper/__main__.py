@@ -1,7 +1,5 @@
 """Experiments of the paper, and ours of the same kind: `python -m bench.paper EXPERIMENT [SCENE ...]`."""
 
-from __future__ import annotations
-
 from radarsdf.simulate import SCENES
 
 from bench.paper import calibration, poses, reflectance, surface

@@ -1,7 +1,5 @@
 """Calibration of a map: `uncertainty` against distances to the truth, `confidence` against true surface."""
 
-from __future__ import annotations
-
 import argparse
 import itertools
 from collections.abc import Iterator, Sequence

@@ -7,8 +7,6 @@ does. FILE are recorded drives with ground truth; each is a kind of its own. Sce
 models fitted without their kind.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,7 +64,7 @@ class Example:
     points: NDArray[np.int64]  # (N,) index of that point, ascending from 0 in steps of 1
 
     @classmethod
-    def of(cls, kind: str, scene: Scene, preset: str, part: str) -> Example:
+    def of(cls, kind: str, scene: Scene, preset: str, part: str) -> "Example":
         config = scene.config(preset)
         contents = scene.without_intensities().fit(config)._contents
         surface = Surface.of(contents, VOXEL_M[preset])

@@ -1,7 +1,5 @@
 """Effect of pose errors, and results of `refine_poses` and `odometry`."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import itertools

@@ -1,7 +1,5 @@
 """Predicted intensities and scans, compared with held-out ones."""
 
-from __future__ import annotations
-
 import argparse
 import itertools
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Surfaces of this package and its peers: errors, time, memory, and size."""
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import tempfile

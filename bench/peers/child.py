@@ -5,8 +5,6 @@ JSON. SCANS and RESULT are .npz files. In a separate process, the peak memory is
 stop the others, and the Python may differ. Besides NumPy, only the method's packages are needed.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import sys

@@ -5,8 +5,6 @@ the default is the first suitable one on the path or of pyenv. `odometry` is kis
 Open3D comes with the extra `peers` instead.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

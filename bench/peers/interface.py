@@ -4,8 +4,6 @@ Each peer runs in a child process (see `child`), and nothing of it is imported h
 the reason, and the peer stays in the tables.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import subprocess
@@ -47,7 +45,7 @@ class Peer:
     intensities: bool = False
     """Whether it uses intensities."""
 
-    def with_changes(self, *, mesh: dict[str, Any] | None = None, **changes: Any) -> Peer:
+    def with_changes(self, *, mesh: dict[str, Any] | None = None, **changes: Any) -> "Peer":
         """Return the peer with other settings of `FitConfig` and arguments of its mesh. Methods of other packages are unchanged."""
         if "changes" not in self.options:
             return self

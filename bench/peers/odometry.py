@@ -4,8 +4,6 @@
 each runs with several voxel sizes; the best one per drive, chosen by the true poses, is reported, in their favour.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import subprocess

@@ -4,8 +4,6 @@ SCANS is an .npz of `points` (N, 3), sensor frame, m, and `counts` (F,), returns
 (F, 4, 4). Besides NumPy, only the peer's package is needed.
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """α-shapes, ball pivoting and Poisson reconstruction by Open3D, on all returns together."""
 
-from __future__ import annotations
-
 import numpy as np
 import open3d as o3d
 

@@ -1,7 +1,5 @@
 """This package as a peer: its default, the published configurations, and the representation of SHINE-Mapping."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

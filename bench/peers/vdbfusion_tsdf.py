@@ -1,7 +1,5 @@
 """VDBFusion: the weighted average of truncated signed distances in a sparse grid (Vizzo et al., Sensors 2022)."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

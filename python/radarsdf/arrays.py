@@ -1,7 +1,5 @@
 """Types of arrays by the type of their numbers; docstrings state shapes and units."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

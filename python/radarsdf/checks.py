@@ -1,7 +1,5 @@
 """Validation of numbers and arrays from users. Errors name the argument."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys

@@ -1,7 +1,5 @@
 """Optional dependencies, and how to install missing ones."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Deferral of Ctrl-C and SIGTERM during critical work, and changes that it cannot divide."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The lattice of the world, shared by all maps, so that their cells coincide."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

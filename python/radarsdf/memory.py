@@ -1,7 +1,5 @@
 """Available memory, and errors for meshes and views that need more."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 # Bytes, measured.

@@ -4,8 +4,6 @@ BLAS, which NumPy calls for `@`, splits a large product among its threads, and t
 and so the last bits. LAPACK solves small systems with one thread.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from radarsdf.arrays import Array, Floats

@@ -1,7 +1,5 @@
 """Rigs: several radars and an inertial measurement unit (IMU) on one body, each with its own mounting."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
@@ -89,7 +87,9 @@ class Rig:
     T_body_sensor: Floats | None  # (K, 4, 4) m
 
     @classmethod
-    def of(cls, sensors: Sequence[Label] | None, T_body_sensor: Mapping[Any, ArrayLike] | None) -> Rig | None:
+    def of(
+        cls, sensors: Sequence[Label] | None, T_body_sensor: Mapping[Any, ArrayLike] | None
+    ) -> "Rig | None":
         """Build from the label of each scan and the mountings by label. None without labels. Raise a ValueError if they do not match."""
         if sensors is None:
             check(T_body_sensor is None, "T_body_sensor needs sensors: the label of the radar of each scan")
@@ -131,5 +131,5 @@ class Rig:
         """Scans of each of the radars that have any, by its label."""
         return {self.labels[i]: np.flatnonzero(self.of_scan == i) for i in np.unique(self.of_scan)}
 
-    def select(self, rows: slice | Ints | Sequence[int]) -> Rig:
+    def select(self, rows: slice | Ints | Sequence[int]) -> "Rig":
         return Rig(self.labels, self.of_scan[rows], self.T_body_sensor)

@@ -1,7 +1,5 @@
 """Scans with poses, streamed from files of any size or held in memory."""
 
-from __future__ import annotations
-
 import dataclasses
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -57,7 +55,7 @@ class Scan:
         return np.asarray(self.points, np.float64) @ R.T + t
 
 
-def finite_returns(scan: Scan, notes: Notes) -> Scan:
+def finite_returns(scan: Scan, notes: "Notes") -> Scan:
     """Keep the returns with finite coordinates and intensity, and count the others."""
     points, intensities = scan.points, scan.intensities
     finite = np.isfinite(points).all(axis=1)
@@ -154,7 +152,7 @@ class Scans:
         ground_truth: Callable[[], Array | None] = lambda: None,
         imu: Callable[[], Imu | None] = lambda: None,
         mountings: Callable[[], Mapping[Any, ArrayLike] | None] = lambda: None,
-    ) -> Scans:
+    ) -> "Scans":
         """Build scans that are read lazily during iteration.
 
         `source` returns a new iterator over them, each with at least one return, and `notes` receive its assumptions. The
@@ -246,7 +244,7 @@ class Scans:
         """Sentences on assumptions and, after a complete pass, on omissions."""
         return list(self._notes.lines)
 
-    def select(self, frames: Ints | Sequence[int]) -> Scans:
+    def select(self, frames: Ints | Sequence[int]) -> "Scans":
         """Select K scans by their indices `frames` (K,), in this order. All scans are read.
 
         Negative indices count from the end. Ground truth and IMU stay the same. Raises an IndexError if one is out of range.
@@ -258,7 +256,7 @@ class Scans:
         scans._rig = None if self._rig is None else self._rig.select(frames)
         return scans
 
-    def with_poses(self, poses: Floats | None, *, other_world: bool = False) -> Scans:
+    def with_poses(self, poses: Floats | None, *, other_world: bool = False) -> "Scans":
         """Return the same scans with other `poses` (F, 4, 4) float64, m. All scans are read.
 
         `other_world`: whether these are in another world frame than the ground truth, which is then dropped.
@@ -270,7 +268,7 @@ class Scans:
             scans._ground_truth = lambda: None
         return scans
 
-    def with_ground_truth(self, points: Callable[[], Array | None]) -> Scans:
+    def with_ground_truth(self, points: Callable[[], Array | None]) -> "Scans":
         """Replace the lidar points (M, 3), world frame, m, by those that `points` returns on first access."""
         scans = copy(self)
         scans._ground_truth = cache(points)

@@ -1,7 +1,5 @@
 """Frozen dataclasses of settings, validated by pydantic."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast

@@ -6,8 +6,6 @@ sleep while they wait, synchronise once per iteration, and are no slower on an i
 core release the GIL. For work of less than a millisecond, there is :attr:`ThreadPool.core_threads`.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import threading

@@ -1,7 +1,5 @@
 """The simulated `astyx` is as noisy as the recorded drives, and each part of its noise is needed for that."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import pytest

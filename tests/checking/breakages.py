@@ -1,7 +1,5 @@
 """Ways to break good data, each with the finding of `radarsdf.check` that reports it, and good recordings."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -35,7 +33,7 @@ class Data:
     doppler_mps: list[NDArray[Any]] | None = None
     times_s: FloatArray | None = None
 
-    def scans(self, numbers: Iterable[int]) -> Data:
+    def scans(self, numbers: Iterable[int]) -> "Data":
         """The scans with these numbers, with the same poses and times."""
         points, intensities, doppler_mps = (
             None if values is None else [values[i] for i in numbers]

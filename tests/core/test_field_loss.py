@@ -1,7 +1,5 @@
 """Losses and gradients of the core, against autograd of the definitions of field and losses."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

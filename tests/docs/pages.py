@@ -1,7 +1,5 @@
 """Read and run the fenced code blocks of a page."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

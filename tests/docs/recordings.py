@@ -1,7 +1,5 @@
 """Write the files that the pages use, from a short simulated drive."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training with extreme settings or for very long: a map stays finite, or the fit raises `Diverged`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Writes bags of ROS 1 and ROS 2 Messages are serialised by rosbags, not by our own code."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal

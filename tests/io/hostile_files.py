@@ -1,7 +1,5 @@
 """Damaged and malicious files: every reader must read a file, or raise a ValueError or OSError that names it."""
 
-from __future__ import annotations
-
 import collections
 import io
 import logging

@@ -7,8 +7,6 @@ reason. `python -m tests.quality.floors` measures MEASURED anew, after a change 
 
 # ruff: noqa: T201 - a command, and tests whose numbers are of interest where they pass
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import sys

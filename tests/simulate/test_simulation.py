@@ -1,7 +1,5 @@
 """The simulator: exact geometry, the radar equation, and correct labels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

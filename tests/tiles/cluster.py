@@ -1,7 +1,5 @@
 """A cluster of dask.distributed with scheduler and workers in separate processes, as on many machines."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

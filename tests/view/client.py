@@ -1,7 +1,5 @@
 """A client of the viewer without a browser: it responds, drags the sensor and records messages."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time
@@ -71,7 +69,7 @@ class PlainClient:
             up_direction=(0.0, 0.0, 1.0),
         )
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Self":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -154,7 +152,7 @@ class Glb(NamedTuple):
         return shown
 
     @classmethod
-    def of(cls, data: bytes) -> Glb:
+    def of(cls, data: bytes) -> "Glb":
         described = int.from_bytes(data[12:16], "little")
         tree = json.loads(data[20 : 20 + described])
         binary = data[28 + described :]

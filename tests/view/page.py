@@ -1,7 +1,5 @@
 """A page in a headless browser: drags, clicks, drawn frames, requests and errors."""
 
-from __future__ import annotations
-
 import base64
 import io
 import shutil
@@ -36,7 +34,7 @@ def why_no_browser() -> str | None:
 
 
 @contextmanager
-def open_page(url: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
+def open_page(url: str, width: int = 1000, height: int = 700) -> "Iterator[Page]":
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     with sync_playwright() as playwright:

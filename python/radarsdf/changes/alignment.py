@@ -1,7 +1,5 @@
 """Registration of two maps by their surfaces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -106,7 +104,7 @@ class _Surface:
     radius_m: float  # root mean square distance of the points from the centre
 
     @classmethod
-    def of(cls, placed: PlacedMap) -> _Surface:
+    def of(cls, placed: PlacedMap) -> "_Surface":
         """Sample points on triangles: vertices lie on the lattice of cells, and would align with that of the other map."""
         rng = np.random.default_rng(0)
         _, areas = across_triangles(placed.vertices, placed.faces)
@@ -122,7 +120,7 @@ class _Surface:
         radius_m = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
         return cls(points, normals, sigma_m, patches, centre, radius_m)
 
-    def placed(self, pose: Floats) -> _Surface:
+    def placed(self, pose: Floats) -> "_Surface":
         """Move the surface by a pose (4, 4)."""
         points, normals = _transformed(self.points, pose), turned(self.normals, pose[:3, :3])
         return replace(self, points=points, normals=normals, centre=points.mean(axis=0))

@@ -1,7 +1,5 @@
 """Result of a comparison of two maps, as coloured surfaces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -127,7 +125,7 @@ class Changes:
                         found.append(region)
         return sorted(found, key=lambda region: -region.area_m2)
 
-    def mesh(self) -> trimesh.Trimesh:
+    def mesh(self) -> "trimesh.Trimesh":
         """Combine the later surface with the faces of the earlier one that are gone or moved, with colours.
 
         The mesh is in the world of the earlier map, m. Green: appeared, vermilion: gone, orange: moved, purple: changed

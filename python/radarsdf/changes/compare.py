@@ -1,7 +1,5 @@
 """Comparison of two maps of one place, or of a map with new scans."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 

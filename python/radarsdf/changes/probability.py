@@ -5,8 +5,6 @@ estimated from all places together (empirical Bayes, Efron 2010), so that chance
 changed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -69,7 +67,7 @@ class PlacedMap:
     sigma_m: Floats  # (V,) standard errors of the vertices, m
 
     @classmethod
-    def of(cls, radar_map: Map) -> PlacedMap:
+    def of(cls, radar_map: Map) -> "PlacedMap":
         """Build from a map whose world is the common frame."""
         mesh = radar_map.mesh(radar_map.config.leaf_size_m, progress=False)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
@@ -183,7 +181,7 @@ class Errors:
     scale: float  # ratio of the errors to the standard errors
 
     @classmethod
-    def of(cls, sides: Sequence[Side]) -> Errors:
+    def of(cls, sides: Sequence[Side]) -> "Errors":
         """Fit by maximum likelihood, with an unknown share of the distances to other surfaces within reach."""
         within = ((side, np.full(len(side.sigma_m), side.reach_m)) for side in sides)
         columns = [np.stack([s.other.distance_m, s.sigma_m, reach_m])[:, s.observed] for s, reach_m in within]
@@ -270,7 +268,7 @@ class _Means:
     values: Floats  # (K,) sensor units
     variances: Floats  # (K,) from the number of returns per mean
 
-    def select(self, chosen: Bools) -> _Means:
+    def select(self, chosen: Bools) -> "_Means":
         return _Means(self.points[chosen], self.values[chosen], self.variances[chosen])
 
     def near(self, x: Floats, reach_m: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -300,7 +298,7 @@ class Differences:
     width: float  # width of the range of intensities, sensor units
 
     @classmethod
-    def of(cls, before: PlacedMap, after: PlacedMap) -> Differences | str:
+    def of(cls, before: PlacedMap, after: PlacedMap) -> "Differences | str":
         """Build from two maps; or return the reason why they cannot be compared.
 
         The predictions of both maps are subtracted from both drives, so views may differ a little within one view bin.

@@ -1,7 +1,5 @@
 """Check of scans and poses before a fit: all findings, worst first."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

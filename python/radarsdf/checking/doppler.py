@@ -1,7 +1,5 @@
 """Checks of Doppler velocities: their agreement with poses, axes, intensities and the mountings of several radars."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Checks of frames, axes and units by the agreement of scans."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -117,8 +115,8 @@ def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
 
 
 def _best(
-    recording: Scans, pairs: Ints, guesses: list[Hypothesis], scores: Floats, in_world: bool
-) -> tuple[Hypothesis, float, float] | None:
+    recording: Scans, pairs: Ints, guesses: "list[Hypothesis]", scores: Floats, in_world: bool
+) -> "tuple[Hypothesis, float, float] | None":
     """Return the hypothesis that is clearly better than the data as they are, its gain and its significance."""
     # `in_world`: whether the points may be in the world frame.
     lags = pairs[:, 1] - pairs[:, 0]

@@ -1,7 +1,5 @@
 """Checks of elevation, ground, noise and intensities, and the cost of a fit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

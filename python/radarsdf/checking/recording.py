@@ -1,7 +1,5 @@
 """Input of a check, with consistent shapes, and its findings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

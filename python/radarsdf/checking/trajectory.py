@@ -1,7 +1,5 @@
 """Checks of the trajectory: rigid transforms, rounding, units, times, duplicates, jumps, drift, and faults that refined poses would hide."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Iterator

@@ -4,8 +4,6 @@
 import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import sys

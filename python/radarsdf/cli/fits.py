@@ -1,7 +1,5 @@
 """``radarsdf fit`` and ``demo``: from scans to a map."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from argparse import Namespace

@@ -1,7 +1,5 @@
 """Inputs of a command: scans, a configuration, a map."""
 
-from __future__ import annotations
-
 import dataclasses
 from argparse import Namespace
 from collections.abc import Iterable

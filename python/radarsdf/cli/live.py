@@ -1,7 +1,5 @@
 """``radarsdf live``: replay a recording as if its scans arrived now, or map running ROS 2 topics."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -1,7 +1,5 @@
 """Commands that use a map: ``mesh``, ``eval``, ``render``, ``view``, ``report``, ``compare`` and ``grid``."""
 
-from __future__ import annotations
-
 import webbrowser
 from argparse import Namespace
 from collections.abc import Iterable

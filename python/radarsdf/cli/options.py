@@ -1,7 +1,5 @@
 """Commands, their arguments and options, as tables apart from the commands, so that help imports none of them."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Output of commands: lines and tables for people, or one JSON object for programs."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -33,7 +31,7 @@ class Results:
             cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             self.add("  ".join(cells).rstrip())
 
-    def add_mesh(self, path: Path, vertices: int, triangles: int, threshold: Threshold) -> None:
+    def add_mesh(self, path: Path, vertices: int, triangles: int, threshold: "Threshold") -> None:
         line = f"{vertices} vertices and {triangles} triangles"
         self.add_file(line, path, vertices=vertices, triangles=triangles)
         self.add(str(threshold), **vars(threshold))

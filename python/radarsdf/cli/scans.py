@@ -1,7 +1,5 @@
 """Commands on scans before a fit: ``check``, ``poses``, ``calibrate``, ``locate``, ``join`` and ``convert``."""
 
-from __future__ import annotations
-
 import math
 from argparse import Namespace
 from collections.abc import Iterable

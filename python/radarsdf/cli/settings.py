@@ -1,7 +1,5 @@
 """``radarsdf config`` and ``info``, and the settings of other commands."""
 
-from __future__ import annotations
-
 import ast
 import platform
 from argparse import Namespace

@@ -1,7 +1,5 @@
 """``radarsdf tiles``: large maps in tiles, locally or on a cluster."""
 
-from __future__ import annotations
-
 import itertools
 import multiprocessing
 from argparse import Namespace

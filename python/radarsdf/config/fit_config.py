@@ -1,7 +1,5 @@
 """The configuration of a fit: the settings changed most often, the groups, the presets, and their TOML file."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys
@@ -160,7 +158,7 @@ class FitConfig:
         return self.training.optimiser == "soap" and not through_normals
 
     @classmethod
-    def quick(cls, **changes: Any) -> FitConfig:
+    def quick(cls, **changes: Any) -> "FitConfig":
         """Return the settings without training: distances averaged over the rays and smoothed, not trained.
 
         The fit takes a fraction of the time; the map's file is larger. Intensities are fitted in closed form. Mesh the map with
@@ -172,7 +170,7 @@ class FitConfig:
         return cls().override(**QUICK).override(**changes)
 
     @classmethod
-    def paper(cls, **changes: Any) -> FitConfig:
+    def paper(cls, **changes: Any) -> "FitConfig":
         """Return the settings of 3QFPI as published, for comparisons.
 
         For a mesh as published, call ``mesh(min_confidence=0, max_uncertainty=math.inf, min_component_triangles=300)``.
@@ -180,7 +178,7 @@ class FitConfig:
         """
         return cls().override(**PAPER).override(**changes)
 
-    def override(self, /, **changes: Any) -> FitConfig:
+    def override(self, /, **changes: Any) -> "FitConfig":
         """Return a copy with some settings changed.
 
         Parameters
@@ -210,7 +208,7 @@ class FitConfig:
         return dataclasses.asdict(self)
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> FitConfig:
+    def from_dict(cls, values: Mapping[str, Any]) -> "FitConfig":
         """Build a configuration from nested dicts, such as those of :meth:`to_dict` or a TOML file.
 
         Missing settings keep their defaults. Raises the errors of :meth:`override`, and a ValueError for anything but a mapping.

@@ -6,8 +6,6 @@ and their published settings for radar. "Measured" means measured on simulated a
 `leaf_size_m` has to change.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

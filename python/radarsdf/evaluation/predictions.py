@@ -1,7 +1,5 @@
 """Errors of predicted intensities, with the paper's nearest-neighbour baseline, and of stated uncertainties and confidences."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 
@@ -164,7 +162,7 @@ class KNNIntensity:
     @classmethod
     def chosen(
         cls, points_world: ArrayLike, sensor_positions: ArrayLike, intensities: ArrayLike, scans: ArrayLike
-    ) -> KNNIntensity:
+    ) -> "KNNIntensity":
         """Build the baseline with the best `candidates` and `k` for these training scans.
 
         Every fifth training scan is held out and predicted from the others. The lowest mean absolute error selects

@@ -1,7 +1,5 @@
 """Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness; metrics as text."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +25,11 @@ _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in flo
 
 
 def surface_metrics(
-    mesh: trimesh.Trimesh, ground_truth: ArrayLike, *, box: ArrayLike | None = None, samples: int = 10_000_000
+    mesh: "trimesh.Trimesh",
+    ground_truth: ArrayLike,
+    *,
+    box: ArrayLike | None = None,
+    samples: int = 10_000_000,
 ) -> dict[str, Any]:
     """Compute the errors of a mesh against ground-truth points by the paper's definitions.
 
@@ -173,7 +175,7 @@ def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
 
 
-def _triangles(mesh: trimesh.Trimesh) -> tuple[Floats, Ints]:
+def _triangles(mesh: "trimesh.Trimesh") -> tuple[Floats, Ints]:
     """Vertices (V, 3), world, m, and faces (F, 3) of a mesh of any program."""
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         msg = f"mesh must have vertices and faces, not be {mesh!r:.50}"

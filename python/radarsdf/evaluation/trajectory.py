@@ -1,7 +1,5 @@
 """Errors of a trajectory against the true one, by the definitions of evo and KITTI."""
 
-from __future__ import annotations
-
 from typing import Any, Literal, get_args
 
 import numpy as np

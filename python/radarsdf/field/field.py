@@ -1,7 +1,5 @@
 """Fields: signed distance, its gradient, and intensity, at points of the local frame; and the averaged field."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from functools import cached_property
 

@@ -7,8 +7,6 @@ An operator could also get the vertex table only through a global registry.
 The core gets tensors as NumPy views of the same memory. Results are bit-identical with any number of threads.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

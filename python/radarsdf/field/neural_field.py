@@ -1,7 +1,5 @@
 """The trained field: encodings and networks, with widths set by the configuration."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -33,7 +31,7 @@ class Geometry:
     feature: Tensor  # (N, geometry_feature_dim), an input of the intensity network
     normals: Tensor | None  # (N, 3) unit vectors towards free space, if the intensity network uses them
 
-    def first(self, count: int, factors: Sequence[Tensor]) -> Geometry:
+    def first(self, count: int, factors: Sequence[Tensor]) -> "Geometry":
         """Return the first `count` points, with each part of the encoding multiplied by its dropout `factors`, if any."""
         normals = None if self.normals is None else self.normals[:count]
         encoding = tuple(part[:count] for part in self.encoding)

@@ -1,7 +1,5 @@
 """Checkpoints of a fit. A resumed fit is bit-identical to an uninterrupted one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time

@@ -1,7 +1,5 @@
 """Schedule of a fit, estimates of its memory and time, its skipped parts, and checks of its feasibility."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence
@@ -71,7 +69,7 @@ class Schedule:
     @classmethod
     def of(
         cls, config: FitConfig, *, surface_returns: int, returns: int, vertices: int, with_intensity: bool
-    ) -> Schedule:
+    ) -> "Schedule":
         """Compute the schedule for `surface_returns` returns without ghosts, and `returns` with them."""
         if not config.train:
             return cls()

@@ -1,7 +1,5 @@
 """Entry point and steps of a fit, from scans to a map."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence

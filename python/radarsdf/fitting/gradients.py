@@ -5,8 +5,6 @@ normals, which are gradients themselves. :class:`CoreGradients` calls the core o
 the time. Tests check that the two agree up to rounding.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Sampling of labelled points on rays, on demand."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,7 +164,7 @@ class _Layout:
     parts: list[tuple[int, int]]  # see :class:`Batch`
 
     @classmethod
-    def of(cls, counts: tuple[int, int, int], parts: int, config: FitConfig) -> _Layout:
+    def of(cls, counts: tuple[int, int, int], parts: int, config: FitConfig) -> "_Layout":
         """Build from `counts` of labelled near samples, all near samples and free samples."""
         num_labelled, num_near, num_free = counts
         taken = max(num_near, num_free)
@@ -207,7 +205,7 @@ class Dropout:
     keep: int  # elements with a byte below this are kept, from 1 to 256
 
     @classmethod
-    def draw(cls, dropout: float, generator: torch.Generator) -> Dropout:
+    def draw(cls, dropout: float, generator: torch.Generator) -> "Dropout":
         """Draw a seed. `dropout`: probability that an element is dropped."""
         return cls(draw_seed(generator), round(256 * (1 - dropout)))
 

@@ -4,8 +4,6 @@ Returns are without ghosts, and for training moved towards flat surfels. Without
 of signed distances at the corners of leaf cells.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -46,7 +44,7 @@ class SurfaceReturns:
         inside: Bools | None = None,
         sums: ScanSums | None = None,
         noise: SensorNoise | None = None,
-    ) -> SurfaceReturns:
+    ) -> "SurfaceReturns":
         """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`, `noise`: of the rays, if known."""
         leaf_m, cleaning, leaves = config.leaf_size_m, config.returns, None
         needed_later = cleaning.free_space or inside is not None or noise is not None

@@ -1,7 +1,5 @@
 """Training of a field. First the surface, then reflectance on the frozen surface."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """File formats of grids: OctoMap's binary octree, OpenVDB, and ROS's map_server (YAML and PGM)."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from os import PathLike

@@ -1,7 +1,5 @@
 """Voxel grid of a box of the world, occupied, free and unknown, and the quantities that planners derive from it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

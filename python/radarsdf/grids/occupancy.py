@@ -1,7 +1,5 @@
 """Conversion of a map to a grid: occupied where a surface is probable, free only where rays crossed."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

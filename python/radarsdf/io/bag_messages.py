@@ -4,8 +4,6 @@ Message types are those of rosbags and the definitions below, never those in a b
 definitions, and old ROS 2 bags have none.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
@@ -287,7 +285,7 @@ class Clock(NamedTuple):
     zeros: Callable[[], None]  # called for stamps of zero
 
     @classmethod
-    def of(cls, times_s: Floats, what: str, wanted: str | None, notes: Notes) -> Clock:
+    def of(cls, times_s: Floats, what: str, wanted: str | None, notes: Notes) -> "Clock":
         """Clock of messages, of which `times_s` (2, N) are stamps and records: by default the stamps, unless zero or constant."""
         stamps_s, known = times_s[0], times_s[:, times_s[0] != 0]
         if wanted is None and (not known.size or (len(stamps_s) > 1 and np.ptp(stamps_s) == 0)):

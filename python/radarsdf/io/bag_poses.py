@@ -1,7 +1,5 @@
 """Poses of the scans in a bag: from odometry, stamped poses, a path, or the tree of transforms (TF)."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from array import array
@@ -45,7 +43,7 @@ class Track:
     parent: str
     child: str = ""  # empty where the messages do not name it
     static: bool = False
-    numbers: array[float] = field(default_factory=lambda: array("d"))  # stamp, record time, pose
+    numbers: "array[float]" = field(default_factory=lambda: array("d"))  # stamp, record time, pose
 
     def add(self, numbers: tuple[float, ...]) -> None:
         self.numbers.extend(numbers)

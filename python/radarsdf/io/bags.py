@@ -1,7 +1,5 @@
 """Scans, poses and inertial measurements from bags: choice of topics and clocks, and streaming in bounded memory."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import re
@@ -87,7 +85,7 @@ class _Radars:
     @classmethod
     def of(
         cls, paths: list[Path], topics: list[Topic], frames: list[str], request: Request, *, partly: bool
-    ) -> _Radars | None:
+    ) -> "_Radars | None":
         """Find the mountings in TF; `partly`: even if others are unknown. None if there are one topic and one frame."""
         if len(topics) == len(frames) == 1:
             return None

@@ -1,7 +1,5 @@
 """Point cloud files: PCD, PLY, KITTI's .bin, NumPy, text, LAS and LAZ. Readers return named columns; the parts of PLY files."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ Each reader states where the scans, the poses and the pose of the radar on its p
 :func:`radarsdf.io.read` take precedence. `T_a_b` transforms points of frame b to frame a.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

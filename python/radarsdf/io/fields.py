@@ -1,7 +1,5 @@
 """Roles of the fields of a radar's point cloud: the names that sensors use, and the returns of a scan."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -68,7 +66,7 @@ class Fields:
     in_degrees: bool = False  # unit of angles whose names have none
 
     @classmethod
-    def of(cls, names: list[str], overrides: Mapping[str, Any] | None = None) -> Fields:
+    def of(cls, names: list[str], overrides: Mapping[str, Any] | None = None) -> "Fields":
         """Find the roles of fields by their names. `overrides` maps roles to fields; None leaves a role out."""
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
@@ -113,7 +111,7 @@ class Fields:
         degrees = (self.in_degrees and dimension == "angle") or _squeeze(bare) in _IN_DEGREES
         return factor_of("deg" if degrees and not unit else unit, dimension, name)
 
-    def with_unit(self, columns: Mapping[str, Array], notes: Notes) -> Fields:
+    def with_unit(self, columns: Mapping[str, Array], notes: Notes) -> "Fields":
         """Return these fields with the unit of their angles, from their names or else from the values in a cloud."""
         names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
         if all(plain_name(name)[1] for name in names):

@@ -1,7 +1,5 @@
 """Atomic writes of files, locks of folders, and the limit of float32 coordinates."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """Read and write meshes, in double precision if the format has it; read ground truth of any kind; GLB, the binary form of glTF 2.0."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Mapping
@@ -47,7 +45,7 @@ def holds_mesh(path: AnyPath) -> bool:
     return suffix in MESH_SUFFIXES and not file.is_dir()
 
 
-def write_mesh(path: AnyPath, mesh: trimesh.Trimesh) -> None:
+def write_mesh(path: AnyPath, mesh: "trimesh.Trimesh") -> None:
     """Write a mesh atomically.
 
     PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. In GLB, a rotation of the root turns the y axis
@@ -76,7 +74,7 @@ def write_mesh(path: AnyPath, mesh: trimesh.Trimesh) -> None:
     write_whole(path, exported.encode() if isinstance(exported, str) else exported)
 
 
-def read_mesh(path: AnyPath) -> trimesh.Trimesh:
+def read_mesh(path: AnyPath) -> "trimesh.Trimesh":
     """Read a triangle mesh.
 
     Parameters
@@ -137,14 +135,14 @@ def read_ground_truth(path: AnyPath) -> Floats:
     return read_points(file)
 
 
-def _scalars_and_colors(mesh: trimesh.Trimesh) -> tuple[Columns, Bytes | None]:
+def _scalars_and_colors(mesh: "trimesh.Trimesh") -> tuple[Columns, Bytes | None]:
     """Scalar attributes (V,) float32 by name, and sRGB colours (V, 4), if there are any, of the vertices."""
     attributes, visual = mesh.vertex_attributes.items(), cast(Any, mesh.visual)
     scalars = {n: np.asarray(v, np.float32) for n, v in attributes if np.shape(v) == (len(mesh.vertices),)}
     return scalars, np.asarray(visual.vertex_colors, np.uint8) if visual.kind == "vertex" else None
 
 
-def _glb(mesh: trimesh.Trimesh) -> bytes:
+def _glb(mesh: "trimesh.Trimesh") -> bytes:
     """Encode as GLB, without what its JSON cannot hold: attributes and metadata that are not finite."""
     scalars, colors = _scalars_and_colors(mesh)
     attributes = {f"_{name}": values for name, values in scalars.items() if np.isfinite(values).all()}
@@ -155,7 +153,7 @@ def _glb(mesh: trimesh.Trimesh) -> bytes:
     return encode_glb(mesh.vertices, mesh.faces, attributes, matrix=T_GLTF_WORLD, extras=numbers)
 
 
-def _ply(mesh: trimesh.Trimesh) -> bytes:
+def _ply(mesh: "trimesh.Trimesh") -> bytes:
     scalars, colors = _scalars_and_colors(mesh)
     columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True)) | scalars
     if colors is not None:

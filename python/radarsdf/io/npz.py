@@ -1,7 +1,5 @@
 """Scans in ``.npz`` files, and arrays in ``.npy`` and ``.npz`` files of any kind."""
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping

@@ -1,7 +1,5 @@
 """Poses by time and in files: tables with named columns, TUM, KITTI, and 4 x 4 matrices; matching to scans."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Read scans from files, folders and bags of any supported kind."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial

@@ -4,8 +4,6 @@ Each format yields :class:`RawScan`; :func:`posed` finds the pose of each, reads
 roles. Unusable data are counted in the notes, and never abort the reading. Folders hold one scan per file.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Topics of running ROS 2 nodes by DDS, without ROS: scans, poses of TF or odometry, and publishing."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -124,7 +122,7 @@ class _Encoded:
         return self.data
 
     @classmethod
-    def deserialize(cls, data: bytes, **_: Any) -> _Encoded:
+    def deserialize(cls, data: bytes, **_: Any) -> "_Encoded":
         return cls(data)
 
     deserialize_key = deserialize

@@ -1,7 +1,5 @@
 """Safetensors files whose arrays are read on demand."""
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Tables of numbers in text files, without silent loss of lines; units by the names of columns, such as ``x [ft]``, or by values."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from bisect import bisect

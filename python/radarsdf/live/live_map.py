@@ -1,7 +1,5 @@
 """Incremental map of a driving robot."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import threading
@@ -405,7 +403,7 @@ class LiveMap:
             self._state.save(path)
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> LiveMap:
+    def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> "LiveMap":
         """Read a map written by :meth:`save`, with its settings, bit-identically. Tracking resumes from the last scans with times.
 
         `folder`: see the constructor.
@@ -431,7 +429,7 @@ class LiveMap:
             live._state.track = live._state.track.placed(scan_id, scan)
         return live
 
-    def mesh(self, **limits: Any) -> trimesh.Trimesh:
+    def mesh(self, **limits: Any) -> "trimesh.Trimesh":
         """Extract the surface as triangles, world frame, m, in voxels of the size of leaf cells; none if there is no surface.
 
         Only changed distances are recomputed. `limits` are `min_confidence`, `max_uncertainty` and `min_component_triangles` of

@@ -1,7 +1,5 @@
 """Columns of cells, partitioned into regions of 64³ leaf cells for local access near changes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

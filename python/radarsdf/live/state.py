@@ -1,7 +1,5 @@
 """State of a live map, and its changes."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Files of a live map: scans and regions moved out of memory, and its saved state."""
 
-from __future__ import annotations
-
 import itertools
 import sqlite3
 import weakref
@@ -83,7 +81,7 @@ class LoggedScan:
         return {name: array for name in _KINDS if (array := getattr(self, name)) is not None}
 
     @property
-    def static(self) -> LoggedScan:
+    def static(self) -> "LoggedScan":
         if self.is_static is None:
             return self
         kept: dict[str, Any] = {name: array[self.is_static] for name, array in self.arrays.items()}
@@ -93,7 +91,7 @@ class LoggedScan:
     def num_bytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
 
-    def at(self, pose: Floats) -> LoggedScan:
+    def at(self, pose: Floats) -> "LoggedScan":
         return replace(self, pose=pose)
 
 
@@ -254,7 +252,7 @@ class ScanLog:
 
     def exchanged(
         self, new: Mapping[ScanId, LoggedScan], old: Iterable[ScanId], sealed: Iterable[ScanId] = ()
-    ) -> ScanLog:
+    ) -> "ScanLog":
         """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
         old, sealed = set(old), set(sealed)
         log = copy(self)
@@ -295,7 +293,7 @@ class ScanLog:
                 self._rows.delete(self._gone)
                 self._gone = frozenset()
 
-    def shrunk(self, max_bytes: int) -> ScanLog:
+    def shrunk(self, max_bytes: int) -> "ScanLog":
         """Return a log with the oldest scans in memory written or sealed until they fit into `max_bytes`."""
         oldest, excess = [], self.num_bytes - max_bytes
         for scan_id, scan in self._scans.items():
@@ -312,7 +310,7 @@ class ScanLog:
             log.num_bytes -= log._scans.pop(scan_id).num_bytes
         return log
 
-    def sealed_beyond(self, centre: Floats, radius_m: float) -> ScanLog:
+    def sealed_beyond(self, centre: Floats, radius_m: float) -> "ScanLog":
         """Return a log with those scans sealed that have returns outside a ball around `centre` (3,), world, m."""
         sealed = []
         for scan_id, scan in self._scans.items():

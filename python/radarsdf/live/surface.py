@@ -1,7 +1,5 @@
 """Surface of a live map: a quick fit of the sums, updated incrementally."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

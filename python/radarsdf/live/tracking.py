@@ -1,7 +1,5 @@
 """Online tracking: registers scans without poses with the last ones, predicted by Doppler or the motion so far."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import operator
@@ -110,7 +108,7 @@ class Track:
     steps: tuple[Step, ...] = ()
     given: tuple[tuple[ScanId, LoggedScan], ...] = ()  # later ones with given poses
 
-    def placed(self, scan_id: ScanId, logged: LoggedScan) -> Track:
+    def placed(self, scan_id: ScanId, logged: LoggedScan) -> "Track":
         """Return the track with a scan at a given pose. It is processed before the next one without."""
         if logged.time_s is None:
             return self

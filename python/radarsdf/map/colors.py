@@ -1,7 +1,5 @@
 """Colour map of intensities."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

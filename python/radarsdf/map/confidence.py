@@ -1,7 +1,5 @@
 """Uncertainty and confidence of a surface, from the evidence of the returns near it; and free space in leaf cells."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

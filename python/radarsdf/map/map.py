@@ -1,7 +1,5 @@
 """The interface of maps: public queries, and the abstract methods behind them."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property, partial
@@ -188,7 +186,7 @@ class Map(ABC):
         max_uncertainty: float | None = None,
         min_component_triangles: int | None = None,
         progress: bool | None = None,
-    ) -> trimesh.Trimesh:
+    ) -> "trimesh.Trimesh":
         """Extract the surface as triangles, by marching cubes in the leaf cells of the map.
 
         Parameters
@@ -261,7 +259,7 @@ class Map(ABC):
         returns: float | None = None,
         noise: bool = False,
         seed: int | np.random.Generator = 0,
-    ) -> View:
+    ) -> "View":
         """Predict the scan of a radar at a pose, and the first surface along each of its beams.
 
         Beams are traced to the surface that :meth:`mesh` keeps by default. Returns are placed on patches of the field's surface in
@@ -310,7 +308,7 @@ class Map(ABC):
         size: tuple[int, int],
         *,
         max_range_m: float = 100.0,
-    ) -> DepthImage:
+    ) -> "DepthImage":
         """Render the surface that :meth:`mesh` keeps by default, as seen by a pinhole camera.
 
         Parameters
@@ -461,11 +459,11 @@ class Map(ABC):
     def _observed(self, world: Floats) -> Bools: ...
 
     @abstractmethod
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     @abstractmethod
-    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
+    def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":
         """Return the data for views from a position (3,) within a range, cached for the next view."""
 
     def tangent_planes(self, x: Floats) -> tuple[Floats, Floats]:

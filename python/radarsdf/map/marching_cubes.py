@@ -5,8 +5,6 @@ lower one. A vertex lies on an edge between two samples a and b of different sig
 it depends on no other sample. Triangles have no gradient: they change only where a sample changes sign.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Mesh extraction: distances at the corners of voxels, triangles, and filtering by evidence."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,7 +44,7 @@ class Surface:
     @classmethod
     def of(
         cls, contents: MapContents, voxel_m: float, box: Floats | None = None, progress: bool | None = False
-    ) -> Surface:
+    ) -> "Surface":
         """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
         vertices, faces, searched = extract_triangles(contents, voxel_m, box, progress)
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
@@ -56,7 +54,7 @@ class Surface:
     @classmethod
     def from_triangles(
         cls, scene: WholeMap, vertices: Floats, faces: Ints32, evidence: EvidenceAt, cells_searched: int
-    ) -> Surface:
+    ) -> "Surface":
         """Build from triangles and the evidence at their vertices."""
         found = probabilities(scene, evidence)
         confidence = found.confidence.astype(np.float32)

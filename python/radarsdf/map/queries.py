@@ -1,7 +1,5 @@
 """The contents of a map, shared by its file, queries and mesh, and their values at positions (N, 3), local frame, m."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The map that a fit returns, stored in one file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -37,7 +35,7 @@ class RadarMap(Map):
         kind = "surface and reflectance" if self.has_intensity else "surface"
         return f"RadarMap({kind}, {self.num_cells} cells, {self.file_bytes / 1e6:.1f} MB)"
 
-    def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
+    def __reduce__(self) -> "tuple[Callable[..., RadarMap], tuple[Any, ...]]":
         tensors, description = storage.parts_of(self._contents)
         return _from_pickle, (save(tensors), description)  # bytes: the pickle needs no classes of PyTorch
 
@@ -56,7 +54,7 @@ class RadarMap(Map):
     def contents_of_any(self) -> MapContents:
         return self._contents
 
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
         from radarsdf.map.mesh import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
 
         return extract_mesh(self._contents, voxel_size, **wanted)
@@ -75,11 +73,11 @@ class RadarMap(Map):
     def view_statistics(self) -> ViewStatisticsAt:
         return self._contents.views_in_world()
 
-    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
+    def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":  # noqa: ARG002 - the whole map
         return self._viewed
 
     @cached_property
-    def _viewed(self) -> ViewedMap:
+    def _viewed(self) -> "ViewedMap":
         from radarsdf.map.view import ViewedMap  # noqa: PLC0415 - trimesh is slow to import
 
         return ViewedMap.of(self._contents)

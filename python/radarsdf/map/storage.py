@@ -1,7 +1,5 @@
 """Serialisation of a map to a safetensors file, and to a pickle."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Limits of the triangles that a mesh keeps, and the confidence threshold of the highest expected F-score."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
@@ -35,7 +33,7 @@ class Limits(NamedTuple):
         min_confidence: float | None = None,
         max_uncertainty: float | None = None,
         min_component_triangles: int | None = None,
-    ) -> Limits:
+    ) -> "Limits":
         """Check the arguments of :meth:`Map.mesh` and fill in defaults."""
         if min_confidence is not None:
             min_confidence = number(min_confidence, "min_confidence")
@@ -67,7 +65,7 @@ class Threshold:
     whole_coverage_of_observed: float
 
     @classmethod
-    def of_mesh(cls, metadata: Mapping[str, Any]) -> Threshold:
+    def of_mesh(cls, metadata: Mapping[str, Any]) -> "Threshold":
         return cls(**{name: metadata[name] for name in cls.__dataclass_fields__})
 
     def __str__(self) -> str:
@@ -90,7 +88,9 @@ class Tally:
     twice_m2: float  # expected true surface with two hits
 
     @classmethod
-    def of(cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, hits: Floats) -> Tally:
+    def of(
+        cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, hits: Floats
+    ) -> "Tally":
         """Build from the vertices of a surface: areas by the core's ``vertex_areas``, and results of :mod:`queries`, (V,) each."""
         true_m2 = confidence * area_m2
         bins = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
@@ -105,7 +105,7 @@ class Tally:
         return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
 
     @classmethod
-    def of_sums(cls, sums: Floats) -> Tally:
+    def of_sums(cls, sums: Floats) -> "Tally":
         area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _BINS)
         existing_m2, once_m2, twice_m2 = sums[-_SCALARS:].tolist()
         return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)

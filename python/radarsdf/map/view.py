@@ -1,7 +1,5 @@
 """Predicted scans: the returns of a radar at a pose, and the first surface along its beams."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -111,7 +109,7 @@ class ViewedMap:
     max_memory_bytes: int | None  # memory limit of views. None: what the system has left
 
     @classmethod
-    def of(cls, contents: MapContents) -> ViewedMap:
+    def of(cls, contents: MapContents) -> "ViewedMap":
         """Build for a whole map, in voxels of a leaf cell's size, which is finer than the noise of a radar."""
         config = contents.config
         check_views(config.max_memory_bytes, cells=len(contents.evidence.visibility))
@@ -135,7 +133,7 @@ class ViewedMap:
         origin: Floats,
         evidence_at: Callable[[Floats], EvidenceAt],
         intensity: _Intensity | None,
-    ) -> ViewedMap:
+    ) -> "ViewedMap":
         """Build with all triangles as patches, and those of the default mesh for tracing. `evidence_at`: of points (N, 3), m."""
         across, twice_m2 = across_triangles(surface.vertices, surface.faces)
         centres = surface.vertices[surface.faces].mean(axis=1)

@@ -1,7 +1,5 @@
 """Agreement of returns of different scans, and its significance."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Sequence
@@ -298,7 +296,7 @@ class Verdict(Gain):
     @classmethod
     def of(
         cls, held: SensorReturns, used: SensorReturns, before: Floats, after: Floats, noise: SensorNoise
-    ) -> Verdict:
+    ) -> "Verdict":
         """Compare `held`-out returns with the `used` ones at poses `before` and `after`.
 
         Returns are not independent. Those of a scan share the error of its pose. Those of a place may lie on one object that

@@ -8,8 +8,6 @@ own frame at a scan is, for a mounting of rotation M and lever arm l,
 and the returns of all radars lie on common planes, whose offsets and tilts are eliminated (Schur complement).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -96,7 +94,7 @@ class BodyPath:
     shares: Floats  # (K, 3)
 
     @classmethod
-    def of(cls, times_s: Floats, poses: Floats, end_s: float, step_s: float, mountings: Floats) -> BodyPath:
+    def of(cls, times_s: Floats, poses: Floats, end_s: float, step_s: float, mountings: Floats) -> "BodyPath":
         """Fit a spline from 0 to `end_s`, with knots every `step_s`, to poses (F, 4, 4) at times (F,)."""
         count = int(np.ceil(end_s / step_s)) + 3
         knots_s = step_s * np.linspace(-3, count, count + 4)
@@ -122,7 +120,7 @@ class BodyPath:
         change = np.concatenate([v, turning, acceleration, accelerating], axis=1)
         return _Motion(weights[0], weights[1], R, p, v, omega, change)
 
-    def moved(self, step: Floats) -> BodyPath:
+    def moved(self, step: Floats) -> "BodyPath":
         count = len(self.positions)
         path, own = step[: _PATH * count].reshape(count, _PATH), step[_PATH * count :].reshape(-1, _OWN)
         return dataclasses.replace(
@@ -288,7 +286,7 @@ class Mounting:
     """Why values are NaN, in words."""
 
     @classmethod
-    def of(cls, given: Floats, T: Floats, covariance: Floats, late_s: float) -> Mounting:
+    def of(cls, given: Floats, T: Floats, covariance: Floats, late_s: float) -> "Mounting":
         """Build from a covariance (7, 7) that includes the time offset, without what it leaves open."""
         covariance = np.where(np.abs(covariance) < _ROUNDING, 0.0, covariance)
         sigmas = np.sqrt(covariance.diagonal())

@@ -1,7 +1,5 @@
 """Validation of scans, times and Doppler: shapes, values and units."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -50,7 +48,7 @@ class CheckedScans:
     @classmethod
     def of(
         cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None
-    ) -> CheckedScans:
+    ) -> "CheckedScans":
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
         fits = doppler_mps is None or times is not None or isinstance(points, Scans)
         check(fits, "Doppler needs times: the time of each scan (times_s), s")
@@ -97,7 +95,7 @@ class CheckedScans:
         times: ArrayLike | None,
         *,
         mounted: bool = True,
-    ) -> tuple[Rig | None, list[CheckedScans]]:
+    ) -> "tuple[Rig | None, list[CheckedScans]]":
         """:meth:`of` for each radar, and the rig if there are several, whose mountings must be known if `mounted`."""
         rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)
         if rig is None:
@@ -117,7 +115,7 @@ class CheckedScans:
             radars.append(dataclasses.replace(checked, rows=rows))
         return rig, radars
 
-    def signed(self) -> CheckedScans:
+    def signed(self) -> "CheckedScans":
         """Choose the sign of the Doppler with which neighbouring scans agree."""
         if self.velocities is None or self.times_s is None:
             return self

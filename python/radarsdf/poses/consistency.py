@@ -1,7 +1,5 @@
 """Consistency of Doppler and times with the motion that returns, or given poses, show, by window of scans."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Iterator
@@ -106,7 +104,7 @@ class Clock:
     sigma_s: float = 0.0  # standard deviation where it is undecided whether times or firing are uneven
 
     @classmethod
-    def of(cls, times_s: Floats, shown_m: Floats, doppler_m: Floats, known: Bools) -> Clock:
+    def of(cls, times_s: Floats, shown_m: Floats, doppler_m: Floats, known: Bools) -> "Clock":
         """Compare times (F,) with those of a radar that fires evenly: which explain the steps (F - 1, 3) that another source shows?"""
         durations_s, errors_s = np.diff(times_s), np.zeros(len(times_s))
         runs = runs_of(times_s)
@@ -229,7 +227,7 @@ class Consistency:
     source: str = "the returns"
 
     @classmethod
-    def of_poses(cls, velocities: SensorVelocities, times_s: Floats, poses: Floats) -> Consistency:
+    def of_poses(cls, velocities: SensorVelocities, times_s: Floats, poses: Floats) -> "Consistency":
         """Compare velocities and times (F,) with poses (F, 4, 4)."""
         shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
         clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
@@ -243,7 +241,7 @@ class Consistency:
         return cls(0 if found else delay_of(*every)[0], (), found, clock, (), "the poses")
 
     @classmethod
-    def of_returns(cls, drive: Drive, config: FitConfig, num_threads: int) -> Consistency:
+    def of_returns(cls, drive: Drive, config: FitConfig, num_threads: int) -> "Consistency":
         """Compare scans, tracked with velocities that are hardly known; without enough of them, nothing is known."""
         durations_s, velocities = np.diff(drive.times_s), drive.velocities
         if velocities is None or len(durations_s) < FEWEST_STEPS:
@@ -368,7 +366,7 @@ class _Pairs:
     @classmethod
     def of(
         cls, scans: list[Floats], motion: DopplerMotion, along: Floats, rows: Ints, yaws: Floats | None
-    ) -> _Pairs:
+    ) -> "_Pairs":
         """Compare the returns of scans `rows` (K,) with those of the next ones, at the rotations of tracked poses.
 
         `yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
@@ -387,7 +385,7 @@ class _Pairs:
         slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
         return cls(back - ahead, shifted - still, still[:, 0] - ahead[:, _SAME], along[rows], slow)
 
-    def select(self, rows: slice | Bools) -> _Pairs:
+    def select(self, rows: slice | Bools) -> "_Pairs":
         return _Pairs(*(column[rows] for column in vars(self).values()))
 
     def __len__(self) -> int:

@@ -1,7 +1,5 @@
 """Velocities of a sensor, or of the body of several, from Doppler, and the motion between scans that they imply."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -55,7 +53,7 @@ class SensorVelocities:
     of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
 
     @classmethod
-    def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> SensorVelocities:
+    def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> "SensorVelocities":
         """Estimate from scans (N_i, 3), sensor frame, m. Raise a NoVelocityError if less than half, or two, yield a velocity."""
         each = sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
@@ -90,7 +88,7 @@ class SensorVelocities:
         """Median speed, m/s."""
         return float(np.median(np.linalg.norm(self.mean_mps, axis=1)))
 
-    def scaled(self, factor: float, sigma: float = 0.0) -> SensorVelocities:
+    def scaled(self, factor: float, sigma: float = 0.0) -> "SensorVelocities":
         """Scale by a factor with relative deviation `sigma`. -1 for a radar with positive Doppler for approaching objects."""
         mean = factor * self.mean_mps
         covariance = factor**2 * self.covariance + sigma**2 * mean[:, :, None] * mean[:, None, :]
@@ -170,7 +168,7 @@ class DopplerMotion(KnownMotion):
     @classmethod
     def by(
         cls, velocities: SensorVelocities, times_s: Floats, poses: Floats, turns: Floats | None = None
-    ) -> DopplerMotion:
+    ) -> "DopplerMotion":
         """Build from times (F,) and approximate poses (F, 4, 4) of scans. `turns` None: those of the poses."""
         durations_s = np.diff(times_s)
         turns = step_vectors(poses)[:, 3:] if turns is None else turns
@@ -183,10 +181,10 @@ class DopplerMotion(KnownMotion):
         measured = velocities, durations_s, turns
         return cls(steps(poses), shares, spans, *measured, bias_sigma=common).at(poses)
 
-    def at(self, poses: Floats) -> DopplerMotion:
+    def at(self, poses: Floats) -> "DopplerMotion":
         return self.turned(steps(poses)[:, :3, :3])
 
-    def turned(self, rotations: Floats) -> DopplerMotion:
+    def turned(self, rotations: Floats) -> "DopplerMotion":
         """Update the translations for rotations (F - 1, 3, 3) of the steps."""
         between, (begin, end, levers) = self.steps.copy(), self.velocities.of_steps
         between[:, :3, :3] = rotations
@@ -224,7 +222,7 @@ class BodyVelocities(SensorVelocities):
     @classmethod
     def of_radars(
         cls, rig: Rig, measured: Sequence[tuple[Ints, SensorVelocities]], times_s: Floats
-    ) -> BodyVelocities:
+    ) -> "BodyVelocities":
         """Build from the scans (N,) of each radar with Doppler and its velocities at them. `times_s` (F,): of all scans."""
         count, mountings = len(rig.of_scan), rig.mountings
         mean, covariance = np.zeros((count, 3)), np.tile(_ANY_MPS**2 * np.eye(3), (count, 1, 1))
@@ -263,7 +261,7 @@ class BodyVelocities(SensorVelocities):
         of_radars_mps, variances = self.of_radars_mps[:, steps], self.variances[:, steps]
         return dataclasses.replace(found, of_radars_mps=of_radars_mps, variances=variances)
 
-    def learnt(self, turn_rates: Sequence[MotionRate | None]) -> BodyVelocities:
+    def learnt(self, turn_rates: Sequence[MotionRate | None]) -> "BodyVelocities":
         """Remove the mean difference of each radar from the others, given turn rates (F - 1), rad/s; None: unknown."""
         rows = np.array([i for i, rate in enumerate(turn_rates) if rate is not None], np.int64)
         if len(rows) == 0:

@@ -10,8 +10,6 @@ within windows of some seconds, each with a free V. The equation is linear in th
 each time offset on a grid initialises robust nonlinear least squares (Gauss-Newton).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -75,7 +73,7 @@ class Gyroscope:
     @classmethod
     def of(
         cls, angular_velocity: Floats, at_s: Floats, times_s: Floats, bias_rad_s: float = FIRST_BIAS_RAD_S
-    ) -> Gyroscope:
+    ) -> "Gyroscope":
         """Integrate rates (G, 3), rad/s, at ascending times (G,) between scans at `times_s` (F,)."""
         inner = at_s[(at_s > times_s[0]) & (at_s < times_s[-1])]
         edges = np.union1d(inner, times_s)
@@ -95,7 +93,7 @@ class Gyroscope:
         covariance = self.bias.covariance * duration_s**2 + self._noise[i] * np.eye(3)
         return MotionRate(self.turns[i] - self.bias.mean * duration_s, covariance)
 
-    def learnt(self, rates: Sequence[MotionRate | None]) -> Gyroscope:
+    def learnt(self, rates: Sequence[MotionRate | None]) -> "Gyroscope":
         """Estimate bias and noise from turn rates, rad/s. Raise an UnusableGyroscopeError if they contradict the gyroscope."""
         known = {i: rate for i, rate in enumerate(rates) if rate is not None and self.durations_s[i] > 0}
         if len(known) < 2:
@@ -161,7 +159,7 @@ class _ImuMotion:
     speeds: Floats  # (G, 3) integral of the specific forces without bias in the initial frame, m/s
 
     @classmethod
-    def of(cls, imu: Imu, rate_bias: Floats, force_bias: Floats) -> _ImuMotion:
+    def of(cls, imu: Imu, rate_bias: Floats, force_bias: Floats) -> "_ImuMotion":
         """Integrate `imu` corrected for biases (K, 3) of rates at evenly spaced knots, and (3,) of forces."""
         assert imu.specific_force is not None
         at = np.linspace(imu.times_s[0], imu.times_s[-1], len(rate_bias))
@@ -207,7 +205,7 @@ class ImuAlignment:
     @classmethod
     def of(
         cls, imu: Imu, velocities: SensorVelocities, times_s: Floats, scan_times_s: Floats | None = None
-    ) -> ImuAlignment | None:
+    ) -> "ImuAlignment | None":
         """Estimate from velocities at ascending `times_s` (K,). None if it is not observable, or does not explain them.
 
         `scan_times_s` (F,): times of the scans of all radars, if there are several.
@@ -375,7 +373,7 @@ class Inertial:
         times_s: Floats,
         begin_s: float,
         radar: Ints | slice = slice(None),
-    ) -> Inertial:
+    ) -> "Inertial":
         """Build for scans at `times_s` (F,) relative to `begin_s`, in the clock of the IMU. `velocities`: at those of `radar`."""
         if imu is None:
             return cls(None)
@@ -399,7 +397,7 @@ class Inertial:
         rates = np.einsum("ij,gj->gi", imu.R_sensor_imu, imu.angular_velocity)
         return cls(Gyroscope.of(rates, imu.times_s, times_s))
 
-    def without(self, why: object) -> Inertial:
+    def without(self, why: object) -> "Inertial":
         return Inertial(None, notes=(*self.notes, f"The gyroscope is not used: {why}."))
 
 

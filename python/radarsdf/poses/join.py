@@ -1,7 +1,5 @@
 """Joining of several sessions at one place in one frame (multi-session mapping)."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import time
@@ -111,7 +109,7 @@ class _Session:
     poses: Floats  # (K, 4, 4) in the world of the session
 
     @classmethod
-    def of(cls, session: Scans, config: FitConfig) -> _Session:
+    def of(cls, session: Scans, config: FitConfig) -> "_Session":
         instance(session, Scans, "a session")
         rig, radars = CheckedScans.of_radars(session, None, None)
         scans = join_radars(rig, [dataclasses.replace(checked, velocities=None) for checked in radars]).scans

@@ -1,7 +1,5 @@
 """Localisation of scans in a map made before."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterable, Sequence
@@ -304,7 +302,7 @@ class _Anchor:
         poses: Floats,
         reach_m: float,
         near: tuple[int, Floats, Floats],
-    ) -> _Anchor:
+    ) -> "_Anchor":
         planes = index.near(poses[:, :3, 3], reach_m, _FINE_CELLS)
         planes.variances = noise.variances
         facing, cells = [], []

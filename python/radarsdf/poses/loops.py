@@ -1,7 +1,5 @@
 """Test whether returns of revisited places agree."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

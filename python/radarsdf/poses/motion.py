@@ -1,7 +1,5 @@
 """Motion between scans: priors, predictions, and measurements."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -32,7 +30,7 @@ class MotionPrior:
     # random-walk turns, that of a real one 7.9 m instead of 1.
     settles: bool
 
-    def after(self, rate: MotionRate | None, elapsed_s: float) -> MotionRate:
+    def after(self, rate: "MotionRate | None", elapsed_s: float) -> "MotionRate":
         """Predict the rate `elapsed_s` later. `rate` None: unknown."""
         if rate is None:
             return MotionRate(np.zeros(3), np.diag(self.usual))
@@ -57,8 +55,8 @@ class MotionPrior:
         return total / information, 1 / information
 
     def learnt(
-        self, rates: Sequence[MotionRate | None], durations_s: Floats, *, with_errors: bool = False
-    ) -> MotionPrior:
+        self, rates: "Sequence[MotionRate | None]", durations_s: Floats, *, with_errors: bool = False
+    ) -> "MotionPrior":
         """Update from rates (None: lost) and durations of steps; `with_errors`: squares include the errors of the rates."""
         errors = float(with_errors)
         known = [rate.mean**2 + errors * rate.covariance.diagonal() for rate in rates if rate is not None]
@@ -81,7 +79,7 @@ class MotionRate:
     mean: Floats  # (3,)
     covariance: Floats  # (3, 3)
 
-    def integrate(self, duration_s: float) -> MotionRate:
+    def integrate(self, duration_s: float) -> "MotionRate":
         """Return the motion at this constant rate, with its covariance."""
         return MotionRate(self.mean * duration_s, self.covariance * duration_s**2)
 
@@ -185,18 +183,18 @@ class Motion:
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
 
     @classmethod
-    def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> Motion:
+    def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> "Motion":
         """Build from poses (F, 4, 4) at `times_s` (F,), or evenly spaced. Step errors accumulate: variances grow with time."""
         spans = spans_of(times_s, len(poses))
         shares = np.repeat(spans[:, None], 6, axis=1)
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
         return cls(steps(poses), shares, spans, variances=variances)
 
-    def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
+    def at(self, poses: Floats) -> "Motion":  # noqa: ARG002 - for motions by Doppler
         """Relinearise at poses (F, 4, 4). Most measurements do not depend on them."""
         return self
 
-    def evidence(self) -> Motion:
+    def evidence(self) -> "Motion":
         """Return the part that is independent of the returns, for covariances."""
         return self
 
@@ -231,7 +229,7 @@ class Motion:
             found[:, scans] -= np.einsum("fki,fk->kfi", jacobian[:, rows], weights[:, rows])
         return found, (weights * self.spans[:, None] * self.bias_sigma).sum(axis=0)[rows]
 
-    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> Motion:
+    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> "Motion":
         """Re-estimate bias and variances from `poses`.
 
         Their covariance has blocks `diagonal` (F, 6, 6) and `below` (F - 1, 6, 6), of increments of the poses `before`: at other
@@ -275,14 +273,16 @@ class SteadyMotion(KnownMotion):
     usual: Floats  # (2,) variances of a step given the usual rates only, m² and rad²
 
     @classmethod
-    def by(cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools) -> SteadyMotion:
+    def by(
+        cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools
+    ) -> "SteadyMotion":
         """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `known` by other sources."""
         spans = spans_of(times_s, len(times_s))
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
         return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 
-    def at(self, poses: Floats) -> SteadyMotion:
+    def at(self, poses: Floats) -> "SteadyMotion":
         """Predict each step of `poses` from its neighbours."""
         durations_s = self.durations_s
         rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)

@@ -1,7 +1,5 @@
 """Radar odometry: poses of scans from returns, Doppler and an IMU; and poses, refined or estimated, for maps and reports."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterable, Sequence
@@ -341,7 +339,7 @@ class PosedScans:
     notes: tuple[str, ...] = ()  # sentences on unused input
 
     @classmethod
-    def of(cls, found: RefinedPoses | Odometry, given: Floats | None = None) -> PosedScans:
+    def of(cls, found: RefinedPoses | Odometry, given: Floats | None = None) -> "PosedScans":
         """Build from the longest segment of odometry, or from refined poses and the original ones (F, 4, 4)."""
         rows = found.longest_segment() if isinstance(found, Odometry) else slice(0, len(found.poses))
         kept = isinstance(found, RefinedPoses) and not found.improved

@@ -1,7 +1,5 @@
 """Planes shared by scans at given poses, and registration of a scan with planes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -101,7 +99,7 @@ class SensorReturns:
     @classmethod
     def of(
         cls, scans: Sequence[Floats], min_range_m: float, max_range_m: float | None, rig: Rig | None = None
-    ) -> SensorReturns:
+    ) -> "SensorReturns":
         """Build from scans (N_i, 3), frame of the poses, m, without returns outside these ranges."""
         scans = scans if rig is None else rig.in_sensors(scans)
         points = np.concatenate(scans)
@@ -115,10 +113,10 @@ class SensorReturns:
     def __len__(self) -> int:
         return len(self.scans)
 
-    def select(self, part: Bools) -> SensorReturns:
+    def select(self, part: Bools) -> "SensorReturns":
         return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part], self.rig)
 
-    def every(self, step: int) -> SensorReturns:
+    def every(self, step: int) -> "SensorReturns":
         return self.select(np.arange(len(self)) % step == 0)
 
     def posed(self, poses: Floats) -> Rays:

@@ -1,7 +1,5 @@
 """Refinement of given poses: the joint estimate of all scans, from common planes and measured motion, and its test."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -73,7 +71,7 @@ class PosesEstimate:
         first_window: int = _FIRST_WINDOW,
         progress: bool | None = False,
         anchor: Anchor | None = None,
-    ) -> PosesEstimate:
+    ) -> "PosesEstimate":
         """Estimate from `given` (F, 4, 4) and measured motions by the Gauss-Newton method, with new planes in each round.
 
         Without an anchor, the mean pose is that of `given`, and the covariance relative to the middle scan.

@@ -1,7 +1,5 @@
 """Rigid motions: increments of poses, relative motions, and alignment of trajectories."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """Search for the place of a submap of several scans in a whole map."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -82,7 +80,7 @@ class OrientedPoints:
     @classmethod
     def of_returns(
         cls, returns: SensorReturns, poses: Floats, leaf_m: float, num_threads: int
-    ) -> OrientedPoints:
+    ) -> "OrientedPoints":
         """Compute the flat surfels of scans at poses (F, 4, 4), of cells in which most returns have one."""
         rays = returns.posed(poses)
         while True:
@@ -123,25 +121,25 @@ class SurfaceIndex:
     @classmethod
     def of_returns(
         cls, returns: SensorReturns, poses: Floats, leaf_m: float, num_threads: int
-    ) -> SurfaceIndex:
+    ) -> "SurfaceIndex":
         """Build from the surfels of scans at poses (F, 4, 4)."""
         surface = OrientedPoints.of_returns(returns, poses, leaf_m, num_threads)
         return cls.of_surface(surface, poses[:, :3, 3].mean(axis=0), leaf_m)
 
     @classmethod
-    def of_surface(cls, surface: OrientedPoints, origin: Floats, leaf_m: float) -> SurfaceIndex:
+    def of_surface(cls, surface: OrientedPoints, origin: Floats, leaf_m: float) -> "SurfaceIndex":
         """Build from a surface in the world of the map, in leaf cells of `leaf_m`."""
         local = dataclasses.replace(surface, points=surface.points - origin)
         return cls(local, LEAVES_PER_SURFEL * leaf_m, origin)
 
     @classmethod
-    def of(cls, radar_map: Map) -> SurfaceIndex:
+    def of(cls, radar_map: Map) -> "SurfaceIndex":
         """Build from the mesh of a map, in its world."""
         leaf_m = radar_map.config.leaf_size_m
         return cls.of_mesh(radar_map.mesh(leaf_m, progress=False), leaf_m)
 
     @classmethod
-    def of_mesh(cls, mesh: trimesh.Trimesh, leaf_m: float) -> SurfaceIndex:
+    def of_mesh(cls, mesh: "trimesh.Trimesh", leaf_m: float) -> "SurfaceIndex":
         """Build from the mesh of a map of leaf cells of `leaf_m`, with `uncertainty_m` of its vertices."""
         check(len(mesh.faces) != 0, "the map has no surface")
         origin = np.asarray(mesh.vertices, np.float64).mean(axis=0)
@@ -166,7 +164,7 @@ class SurfaceIndex:
         write_arrays(path, dict(zip(_ARRAYS, map(np.asarray, values), strict=True)), compressed=True)
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> SurfaceIndex:
+    def load(cls, path: str | PathLike[str]) -> "SurfaceIndex":
         """Read a file written by :meth:`save`. Raise a ValueError if it is another file, or damaged."""
         arrays = arrays_of(path, _ARRAYS)
         with reading(path, "the index of a map"):
@@ -204,7 +202,7 @@ class SurfaceIndex:
         return cKDTree(self.surface.points)
 
     @cached_property
-    def _images(self) -> tuple[_Raster, Array]:
+    def _images(self) -> "tuple[_Raster, Array]":
         steep = self.surface.steep
         raster = _Raster.around(self.surface.points[steep])
         images = gaussian_filter(
@@ -265,7 +263,7 @@ class _Raster:
     pixel_m: float
 
     @classmethod
-    def around(cls, points: Floats) -> _Raster:
+    def around(cls, points: Floats) -> "_Raster":
         lower, upper = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
         pixel_m = max(_PIXEL_M, float(np.sqrt((upper - lower + 1).prod() / _MOST_PIXELS)))
         rows, columns = (np.ceil((upper - lower) / pixel_m) + 5).astype(int).tolist()
@@ -409,7 +407,7 @@ class _Places:
     @classmethod
     def of(
         cls, index: SurfaceIndex, submap: OrientedPoints, starts: Floats, guess: Floats | None = None
-    ) -> _Places:
+    ) -> "_Places":
         """Register the best of the poses `starts` (K, 4, 4), and the best elsewhere. That of a guess becomes the first."""
         points = np.random.default_rng(0).permutation(submap.points - submap.centre)[:_REGISTERED]
         starts = _shifted(starts, submap.centre)
@@ -491,7 +489,7 @@ class _Evidence(NamedTuple):
         return self.significance > self.needed and self.log_odds > _LOG_ODDS
 
     @classmethod
-    def of(cls, scores: Floats, others: Floats, chance: float, blocks: Array) -> _Evidence:
+    def of(cls, scores: Floats, others: Floats, chance: float, blocks: Array) -> "_Evidence":
         """Compare scores (N,), in [0, 1], of points at a place and at another, in `blocks` (N,) with common errors."""
         counts = np.bincount(blocks)
         gains = np.bincount(blocks, scores - others) / counts

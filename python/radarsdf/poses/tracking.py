@@ -1,7 +1,5 @@
 """Drives without poses: prediction of each step, registration with the previous scans, and passes that learn the motion prior."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import deque
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Figures by matplotlib, an extra: views, grids and trajectories. They need no display and do not change its settings."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from typing import Any

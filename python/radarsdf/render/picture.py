@@ -1,7 +1,5 @@
 """Ray-cast pictures of a mesh, which need no display and no OpenGL."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +23,7 @@ _SUPERSAMPLING = 2  # subpixels per pixel and axis, which are averaged for smoot
 
 
 def render(
-    mesh: trimesh.Trimesh,
+    mesh: "trimesh.Trimesh",
     colors: ArrayLike | None = None,
     *,
     width: int = 1600,
@@ -105,7 +103,7 @@ def render(
 
 def save_picture(
     path: AnyPath,
-    mesh: trimesh.Trimesh,
+    mesh: "trimesh.Trimesh",
     *,
     scalar: ArrayLike | None = None,
     label: str = "intensity",

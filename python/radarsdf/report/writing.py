@@ -1,7 +1,5 @@
 """Reports on maps and on changes. The templates in `templates/` hold all prose; Jinja escapes every value."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

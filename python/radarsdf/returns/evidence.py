@@ -1,7 +1,5 @@
 """Evidence of a surface in each leaf cell, and the leaf cells that bridge gaps."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 
@@ -39,13 +37,13 @@ class Evidence:
     @classmethod
     def of(
         cls,
-        returns: ReturnsOfCells,
+        returns: "ReturnsOfCells",
         rays: Rays,
         leaf_keys: Keys,
         leaf_size_m: float,
         num_threads: int = 0,
-        visibility: VisibilityCounts | None = None,
-    ) -> Evidence:
+        visibility: "VisibilityCounts | None" = None,
+    ) -> "Evidence":
         """Compute evidence for leaf cells with ascending keys (C,). `rays` include those of ghosts, which count for visibility."""
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
@@ -82,7 +80,7 @@ class ReturnsOfCells:
     @classmethod
     def of_rays(
         cls, rays: Rays, noise: SensorNoise, leaf_size_m: float, config: ReturnsConfig, num_threads: int
-    ) -> ReturnsOfCells:
+    ) -> "ReturnsOfCells":
         """Sum over all returns in each leaf cell."""
         cells = ReturnCells.of(rays, leaf_size_m, num_threads)
         parts = noise.weights(rays)
@@ -97,16 +95,16 @@ class ReturnsOfCells:
         return found.with_uncertain_poses(ranges_m.astype(np.float32), config)
 
     @classmethod
-    def of_means(cls, means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
+    def of_means(cls, means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> "ReturnsOfCells":
         """Weigh the mean ray of each leaf cell, whose returns have nearly the same range if seen from the same position."""
         weights = weights_of(means.counts, means.ranges_m, noise)
         found = cls(means.keys, *weights, means.scans, means.counts.astype(np.float64))
         return found.with_uncertain_poses(means.ranges_m, config)
 
-    def select(self, part: Bools) -> ReturnsOfCells:
+    def select(self, part: Bools) -> "ReturnsOfCells":
         return ReturnsOfCells(*(column[part] for column in vars(self).values()))
 
-    def with_uncertain_poses(self, ranges_m: Floats32, config: ReturnsConfig) -> ReturnsOfCells:
+    def with_uncertain_poses(self, ranges_m: Floats32, config: ReturnsConfig) -> "ReturnsOfCells":
         """Include the pose uncertainty of `config`. `ranges_m` (M,): mean range of the returns in each cell, m."""
         if config.pose_sigma_m == 0 and config.pose_sigma_rad == 0:
             return self

@@ -5,8 +5,6 @@ mirror, in the direction of the beam. These returns lie at the same place for al
 the number of returns there nor the rays of other returns reveal that they are false.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from radarsdf._core import SurfelMap

@@ -1,7 +1,5 @@
 """Detection of intensity outliers, the scale of the inliers, and samples of returns that do not depend on their order."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -45,7 +43,7 @@ class Plausible:
     high: float
 
     @classmethod
-    def of(cls, intensities: Array, keys: Keys | None = None) -> Plausible:
+    def of(cls, intensities: Array, keys: Keys | None = None) -> "Plausible":
         known = Intensities()
         known.add(intensities, hashes(np.arange(len(intensities), dtype=np.uint32)) if keys is None else keys)
         return known.plausible()
@@ -131,14 +129,14 @@ class IntensityScale:
     high: float  # highest training intensity, sensor units
 
     @classmethod
-    def of(cls, intensities: Floats32 | None) -> IntensityScale | None:
+    def of(cls, intensities: Floats32 | None) -> "IntensityScale | None":
         """Build from `intensities` (N,), sensor units, NaN where missing. None without intensities."""
         if intensities is None:
             return None
         return cls(float(np.nanmin(intensities)), float(np.nanmax(intensities)))
 
     @classmethod
-    def between(cls, intensity_range: ArrayLike) -> IntensityScale:
+    def between(cls, intensity_range: ArrayLike) -> "IntensityScale":
         """Build from a range (low, high). Raise a ValueError unless it is finite and ascending."""
         ends = real_array(intensity_range, "intensity_range")
         fits = ends.shape == (2,) and -np.inf < ends[0] < ends[1] < np.inf

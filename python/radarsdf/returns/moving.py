@@ -5,8 +5,6 @@ RANSAC over draws of three returns gives v, which least squares refines. The met
 "An EKF Based Approach to Radar Inertial Odometry", MFI 2020; the implementation is independent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -176,7 +174,7 @@ class MovingReturns:
     why_none: str | None  # why Doppler was not used, in words
 
     @classmethod
-    def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> MovingReturns:
+    def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> "MovingReturns":
         """Build from scans (N_i, 3), sensor frame, m, and Doppler (N_i,), m/s, either sign, NaN where missing."""
         scans, _, _ = check_scans(points)
         speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
@@ -198,7 +196,7 @@ class MovingReturns:
     @classmethod
     def of_radars(
         cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike], rig: Rig | None
-    ) -> MovingReturns:
+    ) -> "MovingReturns":
         """:meth:`of` for each radar: they differ in the sign of the Doppler and in its ambiguity interval."""
         if rig is None:
             return cls.of(points, doppler_mps)
@@ -235,7 +233,7 @@ class StaticReturns:
         doppler_mps: Sequence[ArrayLike] | None,
         config: ReturnsConfig,
         rig: Rig | None = None,
-    ) -> StaticReturns:
+    ) -> "StaticReturns":
         """Drop moving returns, see :meth:`MovingReturns.of`; keep all without Doppler or ``config.drop_moving``."""
         if doppler_mps is None or not config.drop_moving:
             return cls(points, intensities, 0, None)

@@ -1,7 +1,5 @@
 """Noise of the sensor, estimated from its returns, and noise reduction by moving returns onto planes."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ class SensorNoise:
     elevation_rad: float  # in elevation, rad
 
     @classmethod
-    def median(cls, noises: Sequence[SensorNoise]) -> SensorNoise:
+    def median(cls, noises: "Sequence[SensorNoise]") -> "SensorNoise":
         return cls(*np.median([dataclasses.astuple(noise) for noise in noises], axis=0).tolist())
 
     @property
@@ -57,7 +55,7 @@ class SensorNoise:
         return np.square(self.deviations).tolist()
 
     @property
-    def mean(self) -> SensorNoise:
+    def mean(self) -> "SensorNoise":
         """The same as the noise of one radar."""
         return SensorNoise(*self.deviations)
 
@@ -87,7 +85,7 @@ class SensorNoise:
         """Return :attr:`variances` (F, 3) of the returns of each scan."""
         return np.tile(self.variances, (len(rays.up_of_scan), 1))
 
-    def of_returns(self, rays: Rays, function: Callable[[SensorNoise, Floats32], Floats32]) -> Floats32:
+    def of_returns(self, rays: Rays, function: "Callable[[SensorNoise, Floats32], Floats32]") -> Floats32:
         """Return function(noise of the radar, ranges) of each return, (N,)."""
         return function(self, rays.ranges_m)
 
@@ -101,7 +99,7 @@ class RigNoise(SensorNoise):
     """Weight of a return of each radar, in parts of 1 / `WEIGHT_UNIT`. The mean over all returns is 1."""
 
     @classmethod
-    def of(cls, of_sensors: Sequence[SensorNoise], rays: Rays) -> RigNoise:
+    def of(cls, of_sensors: Sequence[SensorNoise], rays: Rays) -> "RigNoise":
         """Build from the noise of each radar. A return's weight is the mean information of the returns of its radar."""
         ranges_m = [rays.ranges_m[rows].astype(np.float64) for rows in rays.rows_of_sensors()]
         counts = np.array([len(own) for own in ranges_m])

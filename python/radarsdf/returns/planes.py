@@ -1,7 +1,5 @@
 """Surfels: planes fitted to the returns of a cell and its neighbourhood."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,11 +35,11 @@ class Surfels:
     widest: Floats32 | None = None  # (P, 3) axes of the largest variance, unit vectors, in a batch
 
     @classmethod
-    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
+    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> "Surfels":
         return cls.of_sums(ScanSums.of(rays, leaf_size_m, num_threads), num_threads)
 
     @classmethod
-    def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> Surfels:
+    def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> "Surfels":
         cell_size_m = LEAVES_PER_SURFEL * sums.leaf_size_m
         keys, of_cells = sums.merged_moments()
         blocks = CellBlocks(keys)

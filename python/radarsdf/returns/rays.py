@@ -1,7 +1,5 @@
 """Validation of radar scans and their conversion to rays in one local frame."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import logging
@@ -74,7 +72,7 @@ class Rays:
         _, directions, ranges_m = self.in_c_order()
         return hash_rays(directions, ranges_m, intensities, num_threads)
 
-    def without_outliers(self) -> Rays:
+    def without_outliers(self) -> "Rays":
         if self.intensities is None:
             return self
         kept, keys = self.intensities.copy(), self.hashes()
@@ -82,7 +80,7 @@ class Rays:
             kept[own] = Plausible.of(kept[own], keys[own]).kept(kept[own])
         return dataclasses.replace(self, intensities=kept)
 
-    def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> Rays:
+    def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> "Rays":
         """Select rays by a slice, a mask (N,) or row indices (M,), in this order."""
         rows = part if isinstance(part, slice) or part.dtype != np.bool_ else np.flatnonzero(part)
         columns: dict[str, Any] = {n: getattr(self, n) for n in _COLUMNS if getattr(self, n) is not None}

@@ -3,8 +3,6 @@
 The regression is robust, on range, elevation and incidence, independent of the place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -69,7 +67,7 @@ class Response:
         ranges_m: Floats32,
         incidence_rad: Floats32,
         kinds: NDArray[np.int8],
-    ) -> Response:
+    ) -> "Response":
         """Fit the response to `values` (N,) of returns; the other arguments are those of :meth:`at`."""
         some = slice(None, None, -(-len(values) // _MOST_REGRESSED))
         chosen, y = kinds[some], values[some].astype(np.float64)
@@ -282,7 +280,7 @@ class Reflectance:
         leaf_size_m: float,
         ask: Ask | None = None,
         num_threads: int = 0,
-    ) -> Reflectance:
+    ) -> "Reflectance":
         """Fit the reflectance of `rays`, ghosts included: a sensor sees them again.
 
         `unit` (N,): their intensities, scaled to [0, 1]. `surfels`: of these returns or a superset. `ask`: predicts intensities
@@ -365,7 +363,7 @@ class _Groups:
     counts: Floats  # (G,) number of returns
 
     @classmethod
-    def of(cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> _Groups:
+    def of(cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> "_Groups":
         if len(points) <= _MOST_RETURNS:
             return cls(None, points, directions, np.ones(len(points)))
         rows, count = cell_rows(kind, points, directions, incidence_rad)

@@ -1,7 +1,5 @@
 """Sensor model: field of view, resolution, detection threshold and noise, estimated from scans; and the radars of a rig."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -118,7 +116,7 @@ class Sensor:
         return described if unit == SAME_UNIT else described | {"unit": list(unit)}
 
     @classmethod
-    def from_dict(cls, described: dict[str, Any]) -> Sensor:
+    def from_dict(cls, described: dict[str, Any]) -> "Sensor":
         """Build a sensor from the dict of :meth:`to_dict`: values by attribute; `noise` is a dict, too.
 
         Raises a ValueError or TypeError if a number is out of range, or a name is missing or unknown.
@@ -134,7 +132,7 @@ class Sensor:
         noise: SensorNoise | None = None,
         min_range_m: float = 0.0,
         max_range_m: float | None = None,
-    ) -> Sensor:
+    ) -> "Sensor":
         """Estimate from scans (N_i, 3) in the sensor frame, m, and intensities (N_i,), sensor units, NaN where missing.
 
         Returns outside the ranges are ignored. Raises a ValueError if none is left, or all are in one direction.
@@ -147,7 +145,7 @@ class Sensor:
         return cls.of_rays(rays.without_outliers(), poses, noise)
 
     @classmethod
-    def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
+    def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> "Sensor":
         """Estimate from `rays` of scans with poses (F, 4, 4) T_world_sensor, m."""
         T_world_sensor, _ = usable_poses(poses, len(rays.up_of_scan))
         rows = sample(rays.hashes(), _MAX_RETURNS)
@@ -216,7 +214,7 @@ class Radars:
     """(K,) of each, relative to the first that measures intensities. None: it shares no surface with others."""
 
     @classmethod
-    def of(cls, rays: Rays, labels: tuple[Label, ...], config: FitConfig, num_threads: int = 0) -> Radars:
+    def of(cls, rays: Rays, labels: tuple[Label, ...], config: FitConfig, num_threads: int = 0) -> "Radars":
         """Estimate from `rays` of all radars."""
         surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
         noise = rig_noise(surfels, rays, config.returns, num_threads)
@@ -225,7 +223,7 @@ class Radars:
     @classmethod
     def unify(
         cls, rays: Rays, rig: Rig | None, config: FitConfig, num_threads: int = 0
-    ) -> tuple[Rays, Radars | None]:
+    ) -> "tuple[Rays, Radars | None]":
         """Estimate the radars of a rig, and return `rays` in one unit, and them; of one radar as they are, and None."""
         if rig is None:
             return rays, None

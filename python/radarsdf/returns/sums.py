@@ -1,7 +1,5 @@
 """Integer sums over the returns of each leaf cell, and mean rays computed from them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,7 +51,7 @@ class ReturnCells:
     cell_of_ray: Ints32  # (N,) row of each return's cell
 
     @classmethod
-    def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> ReturnCells:
+    def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> "ReturnCells":
         points = np.ascontiguousarray(rays.points)
         occupied = CellSet(cell_size_m)
         occupied.insert(points, num_threads)
@@ -89,7 +87,7 @@ class ScanSums:
     unit: int = 1  # weight of a mean return in the sums
 
     @classmethod
-    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
+    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> "ScanSums":
         return cls.of_cells(rays, ReturnCells.of(rays, leaf_size_m, num_threads), leaf_size_m, num_threads)
 
     @classmethod
@@ -100,7 +98,7 @@ class ScanSums:
         leaf_size_m: float,
         num_threads: int = 0,
         weights: Ints32 | None = None,
-    ) -> ScanSums:
+    ) -> "ScanSums":
         """Sum up `rays` by their cells. `weights` (N,): of each return, in parts of 1 / `WEIGHT_UNIT`; None: all are 1."""
         where = cells.cell_of_ray, cells.keys, leaf_size_m
         sums = sum_returns(*rays.in_c_order(), *where, num_threads, weights)
@@ -133,12 +131,12 @@ class MeanRays:
     ranges_m: Floats32  # (M,) mean range of the returns in each cell, m
 
     @classmethod
-    def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> MeanRays:
+    def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> "MeanRays":
         means = mean_rays(sums.keys, np.ascontiguousarray(sums.sums), sums.leaf_size_m, num_threads)
         points, directions, ranges_m, counts = means
         return cls(sums.keys, points, directions, counts / np.float32(sums.unit), sums.scans, ranges_m)
 
-    def select(self, part: Bools | Ints) -> MeanRays:
+    def select(self, part: Bools | Ints) -> "MeanRays":
         rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
         return MeanRays(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 

@@ -1,7 +1,5 @@
 """What grids and comparisons need of a map: free-space crossings of leaf cells, and mean intensities by place and view."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -44,7 +42,7 @@ class FreeSpace:
         leaf_size_m: float,
         box_cells: Ints | None = None,
         num_threads: int = 0,
-    ) -> FreeSpace:
+    ) -> "FreeSpace":
         """Compute the crossings of `rays` to true returns in the box [lower, upper), (2, 3) leaf cells; None for no limit."""
 
         # Rays end two standard deviations before the return, and where the angular error exceeds one cell: beyond
@@ -60,7 +58,7 @@ class FreeSpace:
         return cls(*find_free_space(*rays.in_c_order(), crossed_m, scans, *box, num_threads))
 
     @classmethod
-    def none(cls) -> FreeSpace:
+    def none(cls) -> "FreeSpace":
         return cls(np.zeros(0, np.uint64), np.zeros((0, _PLANES, _WORDS), np.uint64))
 
     def check(self) -> None:
@@ -138,11 +136,11 @@ class ViewStatisticsAt:
     counts: Floats  # (G,) number of returns
     sigma: float  # standard deviation of single returns from the mean of their group
 
-    def select(self, chosen: Bools) -> ViewStatisticsAt:
+    def select(self, chosen: Bools) -> "ViewStatisticsAt":
         return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @classmethod
-    def together(cls, parts: Sequence[ViewStatisticsAt]) -> ViewStatisticsAt:
+    def together(cls, parts: "Sequence[ViewStatisticsAt]") -> "ViewStatisticsAt":
         weights = np.array([max(float(part.counts.sum()), 1.0) for part in parts])
         variances = np.array([part.sigma**2 for part in parts])
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
@@ -161,7 +159,7 @@ class ViewStatistics:
     sigma: float  # standard deviation of single returns from the mean of their group
 
     @classmethod
-    def of(cls, rays: Rays, unit: Floats32, leaf_size_m: float) -> ViewStatistics:
+    def of(cls, rays: Rays, unit: Floats32, leaf_size_m: float) -> "ViewStatistics":
         rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, leaf_size_m)
         counts = np.bincount(rows, minlength=count)
         of_returns = unit.astype(np.float64)
@@ -183,7 +181,7 @@ class ViewStatistics:
         )
 
     @classmethod
-    def none(cls) -> ViewStatistics:
+    def none(cls) -> "ViewStatistics":
         empty = np.zeros((0, 3), np.float32)
         none = empty[:, 0]
         return cls(empty, empty.astype(np.int8), none.astype(np.float16), none, none.astype(np.int16), 0.0)

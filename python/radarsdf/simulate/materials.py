@@ -1,7 +1,5 @@
 """Radar properties of surfaces: strength of the echo, its angular dependence, and its fading."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

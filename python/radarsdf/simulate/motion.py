@@ -1,7 +1,5 @@
 """Measurements of a radar, a gyroscope and an IMU on a simulated drive, drifting poses, and rigs of several radars."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

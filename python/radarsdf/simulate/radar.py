@@ -1,7 +1,5 @@
 """Radar sensor model, its scans of a scene, and lidar points of the same scene as ground truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property

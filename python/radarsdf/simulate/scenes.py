@@ -1,7 +1,5 @@
 """Ready-made simulations: a lane among buildings, a sports court, a corner reflector on a wall, and a street."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 World frame: z up, m. Signed distances are positive in free space and negative inside a solid.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -196,7 +194,7 @@ class Terrain(Primitive):
     material: Material
 
     @classmethod
-    def random(cls, rng: np.random.Generator, roughness_m: float, material: Material) -> Terrain:
+    def random(cls, rng: np.random.Generator, roughness_m: float, material: Material) -> "Terrain":
         """Draw rolling ground of mean height 0: five octaves with two waves each, from about 40 m down to 2.5 m long.
 
         `roughness_m` is the amplitude of the longest waves, m. Each halving of the wavelength divides the amplitude by 2.5.

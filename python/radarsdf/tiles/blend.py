@@ -1,7 +1,5 @@
 """The fields of many tiles blended into one, with few tiles in memory."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator

@@ -1,7 +1,5 @@
 """Fits of maps of any size: scans to tiles, a fit per tile, and one map."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Mesh of a tiled map: one part per tile, cut on the common lattice, so that parts fit to the bit."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Plan of a tiled map: one JSON file shared by all tasks, and the paths of the tiles' files."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import itertools
@@ -217,7 +215,7 @@ class Plan:
         return content[:-2] + f',\n "crc32": {zlib.crc32(content)}\n}}'.encode()
 
     @classmethod
-    def load(cls, folder: Path) -> Plan:
+    def load(cls, folder: Path) -> "Plan":
         """Load the plan of a folder. Raises a ValueError if it is missing, damaged, or of another version."""
         path = folder / PLAN
         planned = path.exists() or not folder.is_dir()

@@ -1,7 +1,5 @@
 """Planning: one pass over the scans that writes the rays crossing each tile to its file."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import logging

@@ -1,7 +1,5 @@
 """One map over many tiles."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from functools import cached_property, partial
@@ -48,17 +46,17 @@ class TiledMap(TileBlend):
         If the plan is damaged, no tile is done, or a file cannot be read.
     """
 
-    _viewed: tuple[list[Tile], ViewedMap] | None = None
+    _viewed: "tuple[list[Tile], ViewedMap] | None" = None
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
         count = f"{len(self.tiles)} of {len(self.plan.tiles)} tiles"
         return f"TiledMap({kind}, {count} of {self.plan.tile_m:g} m)"
 
-    def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
+    def __reduce__(self) -> "tuple[Callable[..., TiledMap], tuple[Any, ...]]":
         return partial(TiledMap, memory_bytes=self.memory_bytes), (str(self.folder),)
 
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
         from radarsdf.tiles.mesh import mesh_of  # noqa: PLC0415 - trimesh is slow to import
 
         return mesh_of(self, voxel_size, **wanted)
@@ -91,7 +89,7 @@ class TiledMap(TileBlend):
             found.append(of_tile.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
         return ViewStatisticsAt.together(found)
 
-    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
+    def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":
         from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
 
         tiles = [tile.tile for tile in self.tiles]

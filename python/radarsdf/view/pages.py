@@ -1,7 +1,5 @@
 """Pages in the browser: the viewer of a map, a growing surface, and the changes between two maps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -280,7 +278,7 @@ class GrowingView(Page, Sink):
         world = np.concatenate([scan.T_world_sensor[None, :3, 3], scan.world_points])
         self._add_points("/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
 
-    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:  # noqa: ARG002
+    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:  # noqa: ARG002
         local, server, shade = self._local(mesh.vertices), self._server, lightness_of(mesh.vertex_normals)
         if not self._framed:
             self._framed = True

@@ -5,8 +5,6 @@ between two meshes. So a step recolours a cloud of some vertices in place. After
 scene stays until the page has drawn it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from collections.abc import Callable, Hashable, Mapping
@@ -116,7 +114,7 @@ class Canvas:
         radar_map: Map,
         surface: ShownSurface,
         quantities: Mapping[str, Quantity],
-        scans: ScanClouds | None,
+        scans: "ScanClouds | None",
         shown: Callable[[State], None],
     ) -> None:
         self._server, self._surface, self._quantities = server, surface, quantities

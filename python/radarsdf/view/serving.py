@@ -4,8 +4,6 @@ It refuses requests from other web pages in the same browser, which could reach 
 the requested name as `Host`, and the requesting page as `Origin`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import gc
@@ -135,7 +133,7 @@ def stop_server(server: Any) -> None:
         server.stop()
 
 
-def set_initial_camera(server: Any, pose: CameraPose) -> None:
+def set_initial_camera(server: Any, pose: "CameraPose") -> None:
     camera = server.initial_camera
     camera.fov = FOV_RAD
     camera.position, camera.look_at = map(tuple, pose)
@@ -181,7 +179,7 @@ class Page:
     def stop(self) -> None:
         stop_server(self._server)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Self":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,5 @@
 """What a growing map shows, to viewers and files: Foxglove (WebSocket, MCAP) and rerun (web viewer, .rrd), both extras."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import os
@@ -46,7 +44,7 @@ class Sink(ABC):
         """Show the returns of a scan, and the pose of its radar."""
 
     @abstractmethod
-    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:
+    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:
         """Replace the mesh, coloured by its uncertainty, and the sensor positions (F, 3)."""
 
     @abstractmethod
@@ -80,7 +78,7 @@ class FoxgloveSink(Sink):
         rows = np.rec.fromarrays(list(columns.values()), [(name, "<f4") for name in columns])
         self._log_cells(f"/returns/{frame}", of.PointCloud, time_s, rows, frame_id=frame)
 
-    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:
+    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:
         of, positions = self._of, self._local(path)
         line = {"pose": self._pose(self.origin), "thickness": 3.0, "scale_invariant": True}
         lines = of.LinePrimitive(**line).encode() + _points(5, positions)
@@ -145,7 +143,7 @@ class RerunSink(Sink):
         pose = self._rerun.Transform3D(translation=self._local(T[None, :3, 3])[0], mat3x3=T[:3, :3])
         self._log(time_s, {name: pose, f"{name}/returns": self._rerun.Points3D(scan.points, radii=0.05)})
 
-    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:
+    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:
         style = {"vertex_normals": mesh.vertex_normals, "vertex_colors": uncertainty_colors(mesh)}
         local = {"vertex_positions": self._local(mesh.vertices), "triangle_indices": mesh.faces}
         line = self._rerun.LineStrips3D([self._local(path)], colors=[PATH_COLOR])
@@ -180,7 +178,7 @@ class Ros2Sink(Sink):
             transforms = [make_message("geometry_msgs/msg/TransformStamped", **one)]
             self._node.publish("/tf", make_message("tf2_msgs/msg/TFMessage", transforms=transforms))
 
-    def show_surface(self, mesh: trimesh.Trimesh, path: Floats, time_s: float) -> None:  # noqa: ARG002 - poses are published
+    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:  # noqa: ARG002 - poses are published
         scale, message_type = _geometry("Vector3", np.ones(3)), "visualization_msgs/msg/Marker"
         color = make_message("std_msgs/msg/ColorRGBA", r=0.7, g=0.7, b=0.7, a=1.0)
         # Points are encoded by NumPy, as objects would take a second for 50,000 triangles: one of them marks their place.
@@ -275,7 +273,7 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
             server.terminate()
 
 
-def uncertainty_colors(mesh: trimesh.Trimesh) -> Bytes:
+def uncertainty_colors(mesh: "trimesh.Trimesh") -> Bytes:
     """Return the sRGB colours (V, 3) of the vertices of a mesh by their uncertainty."""
     uncertainty_m = np.asarray(mesh.vertex_attributes["uncertainty_m"])
     return Scale.of(uncertainty_m)(uncertainty_m)

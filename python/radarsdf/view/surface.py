@@ -1,7 +1,5 @@
 """Surface of a page, thinned to what a browser can draw, hits of clicks on it, and the quantities that colour it."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -57,7 +55,7 @@ class ShownSurface:
     spacing_m: float  # spacing of vertices: the voxel edge, or more if the mesh was thinned
 
     @classmethod
-    def of(cls, radar_map: Map, voxel_size: float, *, max_vertices: int, **wanted: Any) -> ShownSurface:
+    def of(cls, radar_map: "Map", voxel_size: float, *, max_vertices: int, **wanted: Any) -> "ShownSurface":
         """Mesh a map, and thin the mesh to `max_vertices`. `wanted`: of `Map.mesh`. Raises a ValueError without a surface."""
         whole_number(max_vertices, "max_vertices", _MIN_VERTICES)
         mesh: Any = radar_map.mesh(voxel_size, **wanted)
@@ -98,7 +96,7 @@ def spread_evenly(points: Floats, count: int, edge_m: float) -> tuple[Ints, Ints
     return order[np.cumsum(counts) - counts], of_point, edge_m
 
 
-def thinned(mesh: trimesh.Trimesh, max_vertices: int, edge_m: float) -> tuple[trimesh.Trimesh, float]:
+def thinned(mesh: "trimesh.Trimesh", max_vertices: int, edge_m: float) -> "tuple[trimesh.Trimesh, float]":
     """Thin a mesh to `max_vertices`, one with its attributes per cube of a grid; return it and its vertex spacing, m."""
     import trimesh  # noqa: PLC0415 - slow
 
@@ -165,7 +163,7 @@ class Scale:
     high: float
 
     @classmethod
-    def of(cls, values: Array) -> Scale:
+    def of(cls, values: Array) -> "Scale":
         """Build from the 2nd and the 98th percentile of values (N,)."""
         known = values[np.isfinite(values)]
         low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
@@ -196,7 +194,7 @@ class Quantity:
         return self.scale(self.values(rows, sensor))
 
 
-def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
+def quantities_of(radar_map: "Map", surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
     """Quantities by name, the default first. The intensity scale is that for the first `sensor` position."""
     vertices, found = surface.vertices, {}
 
