@@ -108,6 +108,13 @@ def test_symmetric_places_are_refused(name):
     assert refused.value.places.shape == (2, 4, 4)
 
 
+def test_the_unmapped_half_of_a_hall_is_not_found_in_the_other():
+    hall = KINDS["hall"](seed=2)
+    mapped = radarsdf.fit(hall.points[:40], hall.poses[:40], config=FitConfig.quick(), progress=False)
+    with pytest.raises(radarsdf.Lost, match="two places"):
+        located(mapped, hall, slice(40, None))
+
+
 def test_scans_of_another_place_are_refused(index, elsewhere):
     with pytest.raises(radarsdf.Lost):
         located(index, elsewhere)
