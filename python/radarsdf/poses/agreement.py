@@ -47,6 +47,7 @@ ERRORS = 3.0
 NEIGHBOURS = 16  # nearest neighbours of a return; those of other scans contribute to the density
 _MOST_HELD = 20_000  # maximum number of held-out returns
 _BY_CHANCE = 1e-3  # significance level: probability that true poses seem improved
+_CLOSED_BY_CHANCE = 1e-2  # the same of loops, that are probable: the poses revisit a place
 # Minimum relevant gain, however significant. Measured: up to 0.0006 with true poses, 0.0015 and more where a drift of 0.01 m and
 # 0.05 degrees a step is corrected.
 _LEAST_GAIN = 0.001
@@ -275,10 +276,17 @@ class Verdict(Gain):
     @property
     def needed(self) -> float:
         """Minimum gain: relevant, significant (Student's t), and not explained by crowding."""
+        return max(self._significant(_BY_CHANCE), self.crowding)
+
+    def _significant(self, level: float) -> float:
         if self.count < 2:
             return np.inf
-        by_chance = float(student.ppf(1 - _BY_CHANCE, self.count - 1)) * self.error
-        return max(_LEAST_GAIN, by_chance, self.crowding)
+        return max(_LEAST_GAIN, float(student.ppf(1 - level, self.count - 1)) * self.error)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the gain is that of a closed loop: significant, whether or not scans come closer together."""
+        return bool(self.mean > self._significant(_CLOSED_BY_CHANCE))
 
     @property
     def improved(self) -> bool:

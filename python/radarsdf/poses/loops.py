@@ -1,4 +1,4 @@
-"""Test whether returns of revisited places agree."""
+"""Loops: whether returns of revisited places agree, and poses from which an estimate closes a loop."""
 
 from collections.abc import Iterator
 
@@ -7,8 +7,11 @@ from scipy.spatial import cKDTree
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.poses.agreement import NEIGHBOURS, Gain, density, median_apart_m
-from radarsdf.poses.planes import SensorReturns
+from radarsdf.poses.planes import PlaneMap, SensorReturns, apart_m, thin
+from radarsdf.poses.rigid import increments, lengths_of_steps_m, moved, rotation
+from radarsdf.poses.search import OrientedPoints
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
 _MOST_RETURNS = 50_000  # maximum number of returns compared
 # In median ranges: edge of a part of the path, distance of two parts at one place, length of the path between them, and of a visit.
@@ -18,18 +21,24 @@ _ANGLES = np.arange(8) * (np.pi / 4)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(8)], axis=1)  # of shifts
 _FEWEST_SCANS = 3  # of a visit that is judged
 _ERRORS = 3.0  # minimum agreement, standard errors
+# Registration of a later visit with the planes of earlier scans.
+_SCANS = 12  # of the visit: single ones match wrong planes
+# In median ranges: path before the visit of scans that do not count, path after the earlier visit and distance of scans that do.
+_BEFORE, _AFTER, _NEAR = 1.0, 2.0, 3.0
+_DRIFT = 0.05  # standard deviation relative to the path between the visits
+_PASSES = 3  # of Gauss-Newton, coarse to fine
 
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
     """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted."""
-    visits = list(_visits(poses[:, :3, 3], float(np.median(returns.ranges_m))))
-    if not visits:
+    revisited = visits(returns, poses)
+    if not revisited:
         return []
     returns = returns.every(-(-len(returns) // _MOST_RETURNS))
     points = returns.posed(poses).points.astype(np.float64)
     variances_m2 = noise.mean_variances_m2(returns.ranges_m)
     notes = []
-    for later, earlier in visits:
+    for later, earlier in revisited:
         rows, known = (np.flatnonzero(np.isin(returns.scans, scans)) for scans in (later, earlier))
         if min(len(rows), len(known)) <= NEIGHBOURS:
             continue
@@ -55,10 +64,64 @@ def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_
     return notes
 
 
-def _visits(positions: Floats, range_m: float) -> Iterator[tuple[Ints, Ints]]:
-    """Yield the scans of each later visit of a place and those of earlier ones, from positions (F, 3)."""
-    lengths_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    path_m = np.concatenate([[0.0], np.cumsum(lengths_m)])
+def close_loop(
+    returns: SensorReturns,
+    poses: Floats,
+    visit: tuple[Ints, Ints],
+    variances: list[float],
+    cell_m: float,
+    num_threads: int = 0,
+) -> Floats | None:
+    """Return the poses (F, 4, 4) with a visit registered with earlier scans, and the path to it bent. None if it is there already.
+
+    `variances` are those of :attr:`SensorNoise.variances`. The joint estimate from the returned poses closes the loop if it is one.
+    """
+    later, earlier = visit
+    path_m, range_m = _path_m(poses), float(np.median(returns.ranges_m))
+    later = np.arange(max(later[-1] - _SCANS + 1, 0), later[-1] + 1)
+    own, begin_m, between_m = (
+        poses[later[len(later) // 2]],
+        path_m[earlier[-1]],
+        path_m[later[0]] - path_m[earlier[-1]],
+    )
+    # Scans just before the visit drifted with it.
+    before = path_m < min(begin_m + _AFTER * range_m, path_m[later[0]] - _BEFORE * range_m)
+    before &= np.linalg.norm(poses[:, :3, 3] - own[:3, 3], axis=1) < _NEAR * range_m
+    known, seen = returns.select(before[returns.scans]), returns.select(np.isin(returns.scans, later))
+    if min(len(known), len(seen)) == 0 or between_m <= 0:
+        return None
+    # Surfels, not returns: the noise of few scans makes wrong planes, which attract them.
+    leaf_m = cell_m / LEAVES_PER_SURFEL
+    surfaces = [OrientedPoints.of_returns(part, poses, leaf_m, num_threads).points for part in (known, seen)]
+    if min(map(len, surfaces)) == 0:
+        return None
+    planes = PlaneMap(cell_m, variances)
+    planes.add(surfaces[0])
+    scan = thin((surfaces[1] - own[:3, 3]) @ own[:3, :3])
+    radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
+    prior = np.diag(np.repeat([_DRIFT * between_m, _DRIFT * between_m / radius_m], 3) ** 2)
+    pose = own
+    for _ in range(_PASSES):
+        pose = planes.fit(scan, own, prior, pose).pose
+    if apart_m(pose[None], own, radius_m)[0] < cell_m:
+        return None
+    share = np.clip((path_m - begin_m) / between_m, 0, 1)[:, None]
+    moved_m, turned = np.split(share * increments(own, pose), 2, axis=1)
+    arms_m = poses[:, :3, 3] - own[:3, 3]
+    moved_m += np.einsum("fij,fj->fi", rotation(turned), arms_m) - arms_m
+    return moved(poses, np.concatenate([moved_m, turned], axis=1))
+
+
+def visits(returns: SensorReturns, poses: Floats) -> list[tuple[Ints, Ints]]:
+    """Return the scans of each later visit of a place, and those of earlier ones."""
+    return list(_visits(poses[:, :3, 3], _path_m(poses), float(np.median(returns.ranges_m))))
+
+
+def _path_m(poses: Floats) -> Floats:
+    return np.concatenate([[0.0], np.cumsum(lengths_of_steps_m(poses))])
+
+
+def _visits(positions: Floats, path_m: Floats, range_m: float) -> Iterator[tuple[Ints, Ints]]:
     _, first, part = np.unique(np.floor(path_m / (_PART * range_m)), return_index=True, return_inverse=True)
     pairs = cKDTree(positions[first]).query_pairs(_SAME_PLACE * range_m, output_type="ndarray")
     pairs = pairs[path_m[first[pairs[:, 1]]] - path_m[first[pairs[:, 0]]] > _AWAY * range_m]

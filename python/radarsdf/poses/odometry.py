@@ -19,7 +19,7 @@ from radarsdf.poses.doppler import NOT_USED, BodyVelocities
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, Tracked, plane_cell_m
-from radarsdf.poses.refine import PosesEstimate, RefinedPoses
+from radarsdf.poses.refine import RefinedPoses, estimate_closed
 from radarsdf.poses.rigid import lengths_of_steps_m, steps
 from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
@@ -232,7 +232,7 @@ def _estimate_jointly(
             continue
         motions = drive.motions(tracked, rows)
         # Tracked poses are close to the truth: no short windows are needed.
-        found = PosesEstimate.of(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
+        found = estimate_closed(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance
         notes += open_loops(returns, found.poses, found.noise, rows.start)
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance, notes

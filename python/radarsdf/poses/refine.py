@@ -18,7 +18,7 @@ from radarsdf.poses.agreement import Verdict, held_out
 from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import DopplerMotion
-from radarsdf.poses.loops import open_loops
+from radarsdf.poses.loops import close_loop, open_loops, visits
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import SensorReturns, common_planes, plane_cell_m
 from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
@@ -111,6 +111,32 @@ class PosesEstimate:
             return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
 
         return cls(poses, covariance + _by_biases(evidence, poses, solved), motions, noise, rounds)
+
+
+def estimate_closed(
+    returns: SensorReturns,
+    given: Floats,
+    motions: Sequence[Motion],
+    cell_m: float,
+    config: ReturnsConfig,
+    num_threads: int,
+    first_window: int = _FIRST_WINDOW,
+    progress: bool | None = False,
+) -> PosesEstimate:
+    """Estimate poses as :meth:`PosesEstimate.of`, and close the loops that are beyond the reach of its planes."""
+    fixed = motions, cell_m, config, num_threads
+    found = PosesEstimate.of(returns, given, *fixed, first_window, progress)
+    held = held_out(len(returns), 0)
+    for visit in visits(returns, found.poses):
+        start = close_loop(returns, found.poses, visit, found.noise.variances, cell_m, num_threads)
+        if start is None:
+            continue
+        closed = PosesEstimate.of(returns, start, *fixed, len(start))
+        if Verdict.of(
+            returns.select(held), returns.select(~held), found.poses, closed.poses, closed.noise
+        ).closed:
+            found = dataclasses.replace(closed, poses=aligned(closed.poses, given))
+    return found
 
 
 def _plan(num_scans: int, window: int) -> list[tuple[int, int]]:
@@ -247,7 +273,7 @@ def refine_poses(
     with ThreadPool(config.num_threads) as pool:
         held = held_out(len(returns), config.seed)
         used = returns.select(~held)
-        found = PosesEstimate.of(used, given, motions, cell_m, limits, pool.num_threads, progress=progress)
+        found = estimate_closed(used, given, motions, cell_m, limits, pool.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
         notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
