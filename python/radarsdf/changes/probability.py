@@ -304,13 +304,10 @@ class Differences:
         The predictions of both maps are subtracted from both drives, so views may differ a little within one view bin.
         """
         scales = [p.radar_map.intensity_scale for p in (before, after)]
-        days = [p.radar_map.view_statistics() for p in (before, after)]
-        days = [
-            replace(
-                day, points=p.to_common(day.points), directions=turned(day.directions, p.T_common_map[:3, :3])
-            )
-            for p, day in zip((before, after), days, strict=True)
-        ]
+        days = []
+        for p in (before, after):
+            day, R = p.radar_map.view_statistics(), p.T_common_map[:3, :3]
+            days.append(replace(day, points=p.to_common(day.points), directions=turned(day.directions, R)))
         if None in scales or not all(len(day.counts) for day in days):
             return "Reflectance was not compared: a map has no intensities."
         leaf_m = max(before.leaf_m, after.leaf_m)

@@ -143,21 +143,13 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         [np.linalg.norm(scan[of], axis=1) for scan, of in zip(points, returns, strict=True)]
     )
     total, most = sum(map(len, points)), ranges.max(initial=0.0)
+    distant = sum(int(mask.sum()) for mask in far)
     infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in points)
+    padding = total - len(ranges) - infinite
     for name, count, of, what in (
-        (
-            "far_returns",
-            sum(int(mask.sum()) for mask in far),
-            len(ranges),
-            "beyond 100 times the median range of their scan",
-        ),
+        ("far_returns", distant, len(ranges), "beyond 100 times the median range of their scan"),
         ("returns_not_finite", infinite, total, "not finite in their coordinates"),
-        (
-            "padding",
-            total - len(ranges) - infinite,
-            total,
-            "no measurements: 0 0 0, or consecutive copies of one point",
-        ),
+        ("padding", padding, total, "no measurements: 0 0 0, or consecutive copies of one point"),
     ):
         if count > 0:
             found.append(Finding(name, "note", f"{count} of {of} returns are {what}."))
@@ -167,12 +159,10 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         found.append(Finding("range_sentinel", "warning", evidence))
     kept = [mask & ~apart for mask, apart in zip(returns, far, strict=True)]
     if not all(mask.all() for mask in kept):
-        columns = {name: getattr(recording, name) for name in ("points", "intensities", "doppler_mps")}
         columns = {
-            name: None
-            if arrays is None
-            else [values[mask] for values, mask in zip(arrays, kept, strict=True)]
-            for name, arrays in columns.items()
+            name: [values[mask] for values, mask in zip(arrays, kept, strict=True)]
+            for name in ("points", "intensities", "doppler_mps")
+            if (arrays := getattr(recording, name)) is not None
         }
         recording = Scans(**columns, poses=recording.poses, times_s=recording.times_s)
     empty = np.array([not mask.any() for mask in kept])
