@@ -11,7 +11,7 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.storage import checked_report
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.loops import open_loops
-from radarsdf.poses.odometry import trajectory_report
+from radarsdf.poses.odometry import PosedScans
 from radarsdf.poses.planes import SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.rigid import aligned, turned_by
 from radarsdf.returns.noise import SensorNoise
@@ -253,7 +253,7 @@ def test_the_verdict_is_saved_with_the_map():
     found = refined_of(1201)
     given = found.poses + 0.0
     given[:, 1, 3] = 1
-    way = json.loads(json.dumps(trajectory_report(found, given)))
+    way = json.loads(json.dumps(PosedScans.of(found, given).trajectory))
     assert len(way["scans"]) == len(way["before"]) == len(way["after"]) == len(way["sigma_m"]) == 500
     assert way["after"][-1] == [1200, 0, 0]
     assert way["before"][-1] == [1200, 1, 0]

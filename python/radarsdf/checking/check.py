@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -159,7 +160,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         found.append(Finding("range_sentinel", "warning", evidence))
     kept = [mask & ~apart for mask, apart in zip(returns, far, strict=True)]
     if not all(mask.all() for mask in kept):
-        columns = {
+        columns: dict[str, Any] = {
             name: [values[mask] for values, mask in zip(arrays, kept, strict=True)]
             for name in ("points", "intensities", "doppler_mps")
             if (arrays := getattr(recording, name)) is not None

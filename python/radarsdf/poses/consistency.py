@@ -340,7 +340,6 @@ class Consistency:
     def corrected(self, checked: CheckedScans) -> CheckedScans:
         """Return scans with the velocities and times to use, and notes."""
         assert checked.velocities is not None
-        assert checked.times_s is not None
         (velocities, notes), times_s, yaws = self.applied(checked.velocities), checked.times_s, checked.yaws
         if velocities is None:
             yaws = None

@@ -241,7 +241,7 @@ def refine_poses(
         return RefinedPoses(given, np.zeros((len(given), 6, 6)), False, report)
     sigma_m, sigma_rad = np.maximum(FIRST_SIGMAS, unsteadiness(given, times)).tolist()
     motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times)]
-    if velocities is not None and times is not None:
+    if velocities is not None:
         motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
     with ThreadPool(config.num_threads) as pool:
@@ -275,11 +275,10 @@ def refine_poses(
 
 def _compare_doppler(checked: CheckedScans, given: Floats, rig: Rig | None) -> CheckedScans:
     """Compare the Doppler of a radar with the given poses (F, 4, 4) of all scans."""
-    if checked.velocities is None or checked.times_s is None or len(checked.rows) < 2:
+    if checked.velocities is None or len(checked.rows) < 2:
         return dataclasses.replace(checked, velocities=None)
     poses = given if rig is None else rig.sensor_poses(given)[checked.rows]
     if (checked.velocities.mean_mps[:-1] * steps(poses)[:, :3, 3]).sum() < 0:
         checked = dataclasses.replace(checked, velocities=checked.velocities.scaled(-1.0))
     assert checked.velocities is not None
-    assert checked.times_s is not None
     return Consistency.of_poses(checked.velocities, checked.times_s, poses).corrected(checked)
