@@ -100,9 +100,8 @@ class Rig:
         missing = sorted({str(label) for label in of_scan if label not in row})
         check(not missing, f"T_body_sensor has no mounting of {', '.join(missing)}")
         rows = np.array([row[label] for label in of_scan], np.int32)
-        if T_body_sensor is None:
-            return cls(labels, rows, None)
-        return cls(labels, rows, np.stack([*checked_mountings(T_body_sensor).values()]))
+        known = None if T_body_sensor is None else np.stack([*checked_mountings(T_body_sensor).values()])
+        return cls(labels, rows, known)
 
     @property
     def mountings(self) -> Floats:

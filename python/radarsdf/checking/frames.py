@@ -146,17 +146,16 @@ def _best(
         if good.any():
             top = int(np.argmax(np.where(good, gain.mean, -np.inf)))
             near = good & (gain.mean >= _EQUAL * gain.mean[top])
-            near &= (Gain.over(others, others[top]).significance < _NOT_BEHIND) | (
-                np.arange(len(guesses)) == top
-            )
+            near &= Gain.over(others, others[top]).significance < _NOT_BEHIND
             # Scans that move on a plane agree equally well upside down.
             near = near & upright if (near & upright).any() else near
             # The most common of the mistakes with about equal gains; of its variants, the best one.
             of_kind = near & (kinds == kinds[np.argmax(near)])
             k = int(np.argmax(np.where(of_kind, gain.mean, -np.inf)))
-            noted = noted or (guesses[k], float(gain.mean[k]), float(gain.significance[k]))
-            if _severity(float(gain.mean[k]), guesses[k].finding) == "error":
-                return guesses[k], float(gain.mean[k]), float(gain.significance[k])
+            best = guesses[k], float(gain.mean[k]), float(gain.significance[k])
+            if _severity(best[1], best[0].finding) == "error":
+                return best
+            noted = noted or best
         possible &= (gain.mean > -_MIN_GAIN) | (gain.significance > -_MIN_SIGNIFICANCE)
     return noted
 

@@ -80,8 +80,9 @@ def check_times(recording: Scans) -> Iterator[Finding]:
     if times is None or len(times) < 2 or ascending_times_s(recording) is not None:
         return
     wrong = int((~(np.diff(times) > 0)).sum())
-    late = f"{wrong} of {len(times) - 1} times are not later than the one before"
-    evidence = f"{late}, or not finite: none is used."
+    evidence = (
+        f"{wrong} of {len(times) - 1} times are not later than the one before, or not finite: none is used."
+    )
     yield Finding("times", "warning", evidence)
 
 

@@ -25,24 +25,19 @@ MIN_RETURNS = _SPACED + 2  # scans with fewer have no spacing
 # Limits of the quotients. A return in empty space must not count more than one next to
 # a surface, or hypotheses would win that merely make the fields of view overlap.
 _LEAST, _MOST = 0.1, 1.5
-LEAST_M = 0.05
-"""Minimum distance between returns that counts where no spacing is known, m, below the noise of any radar."""
-LAGS = (1, 2, 4, 8)
-"""Lags between the scans of a pair; multiplied by a stride if the sensor is slow."""
+LEAST_M = 0.05  # minimum distance between returns where no spacing is known, m, below the noise of any radar
+LAGS = (1, 2, 4, 8)  # lags between the scans of a pair; multiplied by a stride if the sensor is slow
 _MOTION = 0.05  # share of the median range: smaller motions hardly show errors of the poses
 
 # Returns of a scan, and pairs of neighbouring scans, that determine the sign of the Doppler.
 _SAMPLED, _PAIRS = 200, 40
 _FIRST_PAIRS = 12
 _FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
-YAW_STEP_RAD = 0.07
-"""Resolution of the yaws between neighbouring scans."""
+YAW_STEP_RAD = 0.07  # resolution of the yaws between neighbouring scans
 _TURNS_RAD = YAW_STEP_RAD * np.arange(-6, 7)
 _TURNS, _HALF_TURNS = (rotation(np.multiply.outer(share * _TURNS_RAD, [0.0, 0.0, 1.0])) for share in (1, 0.5))
-CLEAR = 4.0
-"""Standard errors by which scans must agree better with one sign of the Doppler."""
-ERRORS = 3.0
-"""Standard errors of a significant difference."""
+CLEAR = 4.0  # standard errors by which scans must agree better with one sign of the Doppler
+ERRORS = 3.0  # standard errors of a significant difference
 
 NEIGHBOURS = 16  # nearest neighbours of a return; those of other scans contribute to the density
 _MOST_HELD = 20_000  # maximum number of held-out returns
@@ -222,12 +217,12 @@ def sign_significance(
             best = logs.mean(axis=2).argmin(axis=1)
             yaws[:, i] = _TURNS_RAD[best]
             gains.append(logs[1, best[1]] - logs[0, best[0]])
-        mean = (
-            Gain.of_samples(np.array([gain.mean() for gain in gains]), 1e-6) if gains else Gain(0.0, 1.0, 0)
-        )
+        if not gains:
+            break
+        mean = Gain.of_samples(np.array([gain.mean() for gain in gains]), 1e-6)
         if len(gains) < _FEW_PAIRS:
             # Returns of both scans count, mostly on the same objects: half of them are independent.
-            variance = sum(2 * gain.var() / len(gain) for gain in gains) / max(len(gains), 1) ** 2
+            variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
             mean = dataclasses.replace(mean, error=np.sqrt(max(variance, 1e-12)))
         significance = float(mean.significance)
         clear = abs(significance) > 2 * CLEAR or len(gains) >= min(_PAIRS, len(pairs))

@@ -95,9 +95,10 @@ class SensorVelocities:
         return dataclasses.replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
 
     @property
-    def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
+    def of_steps(self) -> tuple[Floats, Floats, Floats]:
         """Velocities at the beginning and the end of steps, (F - 1, 3) each, and derivatives by turn rates, (F - 1, 3, 3) m."""
-        return self.mean_mps[:-1], self.mean_mps[1:], None
+        begin_mps, end_mps = self.mean_mps[:-1], self.mean_mps[1:]
+        return begin_mps, end_mps, np.broadcast_to(np.zeros((3, 3)), (len(end_mps), 3, 3))
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
         """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
@@ -178,8 +179,7 @@ class DopplerMotion(KnownMotion):
         spans = spans_of(times_s, len(times_s))
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
-        measured = velocities, durations_s, turns
-        return cls(steps(poses), shares, spans, *measured, bias_sigma=common).at(poses)
+        return cls(steps(poses), shares, spans, velocities, durations_s, turns, bias_sigma=common).at(poses)
 
     def at(self, poses: Floats) -> "DopplerMotion":
         return self.turned(steps(poses)[:, :3, :3])
@@ -193,10 +193,9 @@ class DopplerMotion(KnownMotion):
         return dataclasses.replace(self, steps=between)
 
     def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
-        both, levers = super().jacobians(poses), self.velocities.of_steps[2]
-        if levers is not None:
-            for jacobian in both:
-                jacobian[:, :3] -= levers @ jacobian[:, 3:]
+        both = super().jacobians(poses)
+        for jacobian in both:
+            jacobian[:, :3] -= self.velocities.of_steps[2] @ jacobian[:, 3:]
         return both
 
 

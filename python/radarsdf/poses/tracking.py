@@ -79,8 +79,7 @@ class Tracker:
             return self._fit_pose(scan, predicted, predicted.turn.mean)
         spread_m = predicted.spread_m(0.0)
         if spread_m <= _MOST_RADII * radius_m:
-            found = self._search_pose(scan, predicted, capture_m, radius_m)
-            if found is not None:
+            if (found := self._search_pose(scan, predicted, radius_m)) is not None:
                 return found
             # Without a clear match, a scan whose position is predicted is no more lost than one without returns.
             if spread_m <= capture_m:
@@ -128,11 +127,9 @@ class Tracker:
         turn = rotation_vector(last_R.T @ found.pose[:3, :3], turn)
         return dataclasses.replace(found, segment=self.last.segment, turn=turn)
 
-    def _search_pose(
-        self, scan: Floats, predicted: PredictedStep, capture_m: float, radius_m: float
-    ) -> Tracked | None:
+    def _search_pose(self, scan: Floats, predicted: PredictedStep, radius_m: float) -> Tracked | None:
         """Search many poses for the best, if the returns agree there significantly better than elsewhere and than by chance."""
-        sample = thin(scan, _SCORED_RETURNS)
+        sample, capture_m = thin(scan, _SCORED_RETURNS), self._planes.capture_m
 
         def score(poses: Floats) -> Floats:
             return self._planes.coarse.scores(sample, np.ascontiguousarray(poses), self._planes.variances)
@@ -219,17 +216,14 @@ class Drive:
                 gain = before[:, 2] / (before[2, 2] + YAW_STEP_RAD**2 / 4)
                 mean = turned.mean + gain * (yaw - turned.mean[2])
                 turned = MotionRate(mean, before - np.outer(gain, before[2]))
-        lever = None
-        if self.velocities is not None:
-            if isinstance(self.velocities, BodyVelocities):
-                turned = self.velocities.turn_given(turned, i - 1, duration_s)
-            covariance = self.velocities.step_covariance(i - 1, duration_s)
-            begins, ends, levers = self.velocities.of_steps
-            begin, end = begins[i - 1], ends[i - 1]
-            lever = None if levers is None else levers[i - 1]
-        else:
+        if self.velocities is None:
             velocity = self.moves.after(move, elapsed_s)
-            covariance, begin, end = velocity.integrate(duration_s).covariance, velocity.mean, velocity.mean
+            covariance = velocity.integrate(duration_s).covariance
+            return PredictedStep(turned, velocity.mean, velocity.mean, covariance, duration_s)
+        if isinstance(self.velocities, BodyVelocities):
+            turned = self.velocities.turn_given(turned, i - 1, duration_s)
+        covariance = self.velocities.step_covariance(i - 1, duration_s)
+        begin, end, lever = (each[i - 1] for each in self.velocities.of_steps)
         return PredictedStep(turned, begin, end, covariance, duration_s, lever)
 
     @property
