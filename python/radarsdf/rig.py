@@ -49,12 +49,10 @@ class Imu:
 
 def checked_rotation(R_sensor_imu: ArrayLike) -> Floats:
     """Convert to a rotation (3, 3); of a rigid transform (4, 4), take its rotation."""
-    matrix: Floats = real_array(R_sensor_imu, "R_sensor_imu")
+    R: Floats = real_array(R_sensor_imu, "R_sensor_imu")
     whole = np.eye(4)
-    whole[:3, :3] = matrix[:3, :3] if matrix.shape in ((3, 3), (4, 4)) else 0.0
-    what = (
-        f"R_sensor_imu, of shape {matrix.shape}, is no rotation matrix (3, 3): orthogonal, with determinant 1"
-    )
+    whole[:3, :3] = R[:3, :3] if R.shape in ((3, 3), (4, 4)) else 0.0
+    what = f"R_sensor_imu, of shape {R.shape}, is no rotation matrix (3, 3): orthogonal, with determinant 1"
     check(are_rigid(whole[None]).all(), what)
     return whole[:3, :3]
 

@@ -110,9 +110,8 @@ class _Surface:
         _, areas = across_triangles(placed.vertices, placed.faces)
         chosen = rng.choice(len(areas), min(len(areas), _MAX_POINTS), p=areas / areas.sum())
         corners, shares = placed.faces[chosen], rng.dirichlet(np.ones(3), len(chosen))
-        points, normals = (
-            np.einsum("nk,nki->ni", shares, values[corners]) for values in (placed.vertices, placed.normals)
-        )
+        points = np.einsum("nk,nki->ni", shares, placed.vertices[corners])
+        normals = np.einsum("nk,nki->ni", shares, placed.normals[corners])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
         sigma_m = np.einsum("nk,nk->n", shares, placed.sigma_m[corners])
         patches = np.unique(np.floor(points / _PATCH_M), axis=0, return_inverse=True)[1].ravel()
@@ -197,15 +196,13 @@ def _gauss_newton(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[F
         known &= np.einsum("ni,ni->n", normals, own) >= PARALLEL
         if known.sum() < CELLS_OF_SURFACE:
             break
-        distance_m, sigma_m = distance_m[known], sigma_m[known]
+        distance_m, sigma_m, patches = distance_m[known], sigma_m[known], surface.patches[known]
         arms = there[known] - surface.centre - offset[:3]
         odds = odds_of_differences(distance_m, sigma_m, before.reach_m)
         weights = (1 - posterior(odds, share_of_changes(odds))) / sigma_m**2
         of_target, of_own = _jacobian(arms, normals[known]), _jacobian(arms, own[known])
         slope = np.einsum("ni,n,nj->ij", of_own, weights, of_target)
-        parts = np.stack(
-            [np.bincount(surface.patches[known], column * weights * distance_m) for column in of_own.T]
-        )
+        parts = np.stack([np.bincount(patches, column * weights * distance_m) for column in of_own.T])
         scatter = np.einsum("ip,jp->ij", parts, parts)
         scatter += CELLS_OF_SURFACE * np.einsum("ni,n,nj->ij", of_own, weights, of_own) + np.eye(6)
         weighted = np.linalg.solve(scatter, slope).T

@@ -244,9 +244,9 @@ def compare(
             returns={"free_space": True} | {name: getattr(before.config.returns, name) for name in names},
         )
         after = fit(after, poses, intensities, config=config, progress=progress)
-    elif poses is not None or intensities is not None:
-        msg = "poses and intensities belong to new scans: a map has its own"
-        raise ValueError(msg)
+    else:
+        given = poses is not None or intensities is not None
+        check(not given, "poses and intensities belong to new scans: a map has its own")
     check_free_space(after, "after")
     placed = PlacedMap.of(before), PlacedMap.of(after)
     for name, found in zip(("before", "after"), placed, strict=True):
@@ -260,7 +260,7 @@ def compare(
     share = share_of_changes(np.concatenate([region for *_, region in odds]))
     gone = _classify(sides[0], odds[0], share, GONE)
     appeared = _classify(sides[1], odds[1], share, APPEARED)
-    _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
+    _check_common(sides, [gone.kind, appeared.kind], errors, alignment.words)
     differences = Differences.of(earlier, later)
     offset, words = None, differences
     if isinstance(differences, Differences):
@@ -320,14 +320,15 @@ def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
 
 
 def _check_common(
-    sides: Sequence[Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, alignment: Alignment
+    sides: Sequence[Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, words: str
 ) -> None:
     # Maps in wrong frames still agree about the ground and level floors, so level and steep surfaces are tested separately;
     # and on both sides, since a place may have been cleared.
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
-    if seen == 0:
-        msg = f"the maps have no surface in common: they are of other places, or in other frames. {alignment.words}"
-        raise ValueError(msg)
+    check(
+        seen,
+        f"the maps have no surface in common: they are of other places, or in other frames. {words}",
+    )
     for name, is_level in (("level", True), ("steep", False)):
         changed, agree = np.zeros(2), np.zeros(2)
         for i, (side, of_side) in enumerate(zip(sides, kinds, strict=True)):
@@ -339,6 +340,6 @@ def _check_common(
             shares = " and ".join(f"{part:.0%}" for part in changed / (changed + agree))
             msg = (
                 f"the maps do not fit together: of the {name} surfaces that both observed, {shares} would have changed. "
-                f"Give maps of one place, in about one frame. {alignment.words}"
+                f"Give maps of one place, in about one frame. {words}"
             )
             raise ValueError(msg)

@@ -140,9 +140,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
     numbers, points = np.arange(len(recording)), recording.points
     returns = [measured(scan) for scan in points]
     far = [too_far(*each) for each in zip(points, returns, strict=True)]
-    ranges = np.concatenate(
-        [np.linalg.norm(scan[of], axis=1) for scan, of in zip(points, returns, strict=True)]
-    )
+    ranges = np.concatenate([np.linalg.norm(x[of], axis=1) for x, of in zip(points, returns, strict=True)])
     total, most = sum(map(len, points)), ranges.max(initial=0.0)
     distant = sum(int(mask.sum()) for mask in far)
     infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in points)
@@ -168,9 +166,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         recording = Scans(**columns, poses=recording.poses, times_s=recording.times_s)
     empty = np.array([not mask.any() for mask in kept])
     if empty.any():
-        evidence = (
-            f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
-        )
+        evidence = f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {empty.argmax()}."
         found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
     if not empty.all():
         found += trajectory.check_rigid(recording)

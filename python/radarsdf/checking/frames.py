@@ -211,9 +211,8 @@ def hypotheses(poses: Floats, pairs: Ints, *, all_axes: bool = True) -> Iterator
     `all_axes`: whether to try all 47 permutations and reflections of axes, of points and positions, or the eight most common.
     """
     motions, R, t = relative(poses, pairs), poses[:, :3, :3], poses[:, :3, 3]
-    yield Hypothesis(
-        "poses_inverted", "the poses are inverted", relative(np.linalg.inv(poses).astype(np.float64), pairs)
-    )
+    inverted = np.linalg.inv(poses).astype(np.float64)
+    yield Hypothesis("poses_inverted", "the poses are inverted", relative(inverted, pairs))
     still = np.tile(np.eye(4), (len(pairs), 1, 1))
     yield Hypothesis("points_in_world_frame", "the points are in the world frame already", still)
     rotations_by_90 = Rotation.create_group("O").as_matrix().round()

@@ -79,10 +79,8 @@ def check_times(recording: Scans) -> Iterator[Finding]:
     times = recording.times_s
     if times is None or len(times) < 2 or ascending_times_s(recording) is not None:
         return
-    wrong = int((~(np.diff(times) > 0)).sum())
-    evidence = (
-        f"{wrong} of {len(times) - 1} times are not later than the one before, or not finite: none is used."
-    )
+    wrong, count = int((~(np.diff(times) > 0)).sum()), len(times) - 1
+    evidence = f"{wrong} of {count} times are not later than the one before, or not finite: none is used."
     yield Finding("times", "warning", evidence)
 
 
@@ -336,9 +334,8 @@ def check_order(recording: Scans, numbers: Ints) -> Iterator[Finding]:
         for chosen in (neighbours, crossing):
             compared = Gain.over(scores[chosen], agreement.scores(others[chosen], motions[:, chosen]))
             gain, significance = float(compared.mean[0]), float(compared.significance[0])
-            if gain < max(
-                best[0] if chosen is crossing else _EXCHANGE_GAIN, _CLOSES * excess[neighbours].mean()
-            ):
+            needed = best[0] if chosen is crossing else _EXCHANGE_GAIN
+            if gain < max(needed, _CLOSES * excess[neighbours].mean()):
                 break
         else:
             if significance >= _EXCHANGE_SIGNIFICANCE:

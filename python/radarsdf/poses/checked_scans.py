@@ -7,17 +7,12 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Self
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import MAX_TIME_S, check, real_array, values_of_scans
 from radarsdf.poses.agreement import CLEAR, sign_significance, turns_fast
-from radarsdf.poses.doppler import (
-    NOT_USED,
-    BodyVelocities,
-    NoVelocityError,
-    SensorVelocities,
-    radial_offset_mps,
-)
+from radarsdf.poses.doppler import NOT_USED, BodyVelocities, NoVelocityError, SensorVelocities
 from radarsdf.returns.moving import without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Rig
@@ -47,9 +42,7 @@ class CheckedScans:
     yaws: Floats | None = None
 
     @classmethod
-    def of(
-        cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None
-    ) -> "CheckedScans":
+    def of(cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None) -> Self:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
         check(doppler_mps is None or times is not None or isinstance(points, Scans), _NO_TIMES)
         _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
@@ -77,7 +70,7 @@ class CheckedScans:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
-        if offset_mps := radial_offset_mps(scans, speeds, velocities):
+        if offset_mps := velocities.radial_offset_mps(scans, speeds):
             offset = f"{offset_mps:.2f} m/s are added to that of all returns"
             return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {offset}."])
         each = zip(scans, speeds, velocities.of_scans, strict=True)
@@ -93,15 +86,13 @@ class CheckedScans:
         times: ArrayLike | None,
         *,
         mounted: bool = True,
-    ) -> "tuple[Rig | None, list[CheckedScans]]":
+    ) -> tuple[Rig | None, list[Self]]:
         """:meth:`of` for each radar, and the rig if there are several, whose mountings must be known if `mounted`."""
         rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)
         if rig is None:
             return None, [cls.of(points, doppler_mps, times)]
-        check(
-            not mounted or rig.T_body_sensor is not None,
-            "T_body_sensor is missing: the mounting of each radar",
-        )
+        known = rig.T_body_sensor is not None
+        check(known or not mounted, "T_body_sensor is missing: the mounting of each radar")
         check(speeds is None or times_ is not None, _NO_TIMES)
         times_s, radars = _checked_times(times_, len(given)), []
         for rows in rig.scans_of_radars().values():
@@ -111,7 +102,7 @@ class CheckedScans:
             radars.append(dataclasses.replace(checked, rows=rows, times_s=since_s, begin_s=begin_s))
         return rig, radars
 
-    def signed(self) -> "CheckedScans":
+    def signed(self) -> Self:
         """Choose the sign of the Doppler with which neighbouring scans agree."""
         if self.velocities is None:
             return self

@@ -169,9 +169,8 @@ def delay_of(
         moves = own, shown - own, later - own, seen * (later - own)
         scaled, *others = (np.einsum("fij,fj->fi", whitening, each)[used] for each in moves)
         # Without the part that a wrong scale explains.
-        left, change, expected = (
-            v - scaled * (v * scaled).sum() / max((scaled**2).sum(), 1e-12) for v in others
-        )
+        square = max((scaled**2).sum(), 1e-12)
+        left, change, expected = (v - scaled * (v * scaled).sum() / square for v in others)
         share, error, remaining = _slope(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
         # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
@@ -203,9 +202,7 @@ _FREE_SCALE, _FREE_ACROSS = 0.15, 0.04
 _SCALES = np.geomspace(0.4, 2.5, 17)
 _SAME = len(_SCALES) // 2
 _SAME_TRACKED = 0.05  # relative difference of tracked steps and right Doppler: simulated scenes up to 0.02
-_SHIFTS_M = np.concatenate(
-    [np.outer([sign * 4.0, sign * 2.0, sign], axis) for sign in (1, -1) for axis in np.eye(3)[:2]]
-)
+_SHIFTS_M = np.kron([[1.0], [-1.0]], np.kron(np.eye(3)[:2], [[4.0], [2.0], [1.0]]))
 # Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
 _SAME_SCALE = 1.1
 _MEASURED = 0.2  # relative difference from the Doppler beyond which confidence limits leave its scale open
@@ -429,7 +426,7 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
     """Judge Doppler by window of pairs, between scans (K + 1,): return the clearest contradiction, and motions not excluded."""
     tried = list(windows_of(len(pairs)))
     level = BY_CHANCE / len(tried)
-    contradictions, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
+    against, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
     # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
     moving = pairs.select(~pairs.slow)
     pattern_moves = len(moving) >= FEWEST_STEPS and Gain.of_samples(moving.moved).excess(BY_CHANCE) < 1
@@ -454,8 +451,6 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             found += [(True, *other) for other in moving.others(level)]
             if abs(moving.farthest - 1) > _MEASURED:
                 doubts.append(OtherMotion(first, last, moving.farthest, confirmed=False))
-        contradictions += [
-            (c, excess, OtherMotion(first, last, r, c)) for c, excess, r in found if excess > 1
-        ]
-    clearest = max(contradictions, key=lambda one: one[:2])[2] if contradictions else None
+        against += [(c, excess, OtherMotion(first, last, r, c)) for c, excess, r in found if excess > 1]
+    clearest = max(against, key=lambda one: one[:2])[2] if against else None
     return clearest, tuple(doubts)

@@ -73,11 +73,39 @@ class SensorVelocities:
         # Includes the noise of the velocities: an overestimate.
         squares = np.diff(mean[found], axis=0)[usual] ** 2
         change = squares.sum(axis=0) / max(durations[usual].sum(), 1e-9) + LEAST_MPS**2
-        for i in np.flatnonzero(~found):
-            mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
-            away_s = np.abs(at - times_s[i]).min()
-            covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
+        mean[~found] = interpolate(times_s[~found], at, mean[found])
+        away_s = np.abs(at - times_s[~found, None]).min(axis=1)
+        covariance[~found] = np.multiply.outer(away_s, np.diag(change)) + covariance[found].mean(axis=0)
         return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each)
+
+    def radial_offset_mps(self, scans: Sequence[Floats], doppler_mps: Sequence[Array]) -> float:
+        """Return a significant constant in the Doppler of all static returns, m/s, or 0.
+
+        Returns in different directions distinguish it from a velocity.
+        """
+        offsets, variances = [], []
+        if folding_interval_mps(doppler_mps) is not None:
+            return 0.0  # aliased speeds hide it
+        for scan, speeds, velocity in zip(scans, doppler_mps, self.of_scans, strict=True):
+            used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
+            if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
+                continue
+            away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
+            columns = np.column_stack([-away, np.ones(len(away))])
+            fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
+            if rank == 4:
+                inverse = np.linalg.inv(normal_matrix(columns, columns))
+                offsets.append(float(fitted[3]))
+                variances.append(
+                    max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2) * float(inverse[3, 3])
+                )
+        if len(offsets) < _FEWEST_OFFSETS:
+            return 0.0
+        weights = 1 / np.array(variances)
+        mean = float((weights * offsets).sum() / weights.sum())
+        squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
+        error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
+        return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
 
     def select(self, rows: slice | Ints) -> Self:
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
@@ -111,36 +139,6 @@ class SensorVelocities:
     def step_covariances(self, durations_s: Floats) -> Floats:
         """Return the covariances (F - 1, 3, 3) of all steps, m²."""
         return np.stack([self.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
-
-
-def radial_offset_mps(
-    scans: Sequence[Floats], doppler_mps: Sequence[Array], velocities: SensorVelocities
-) -> float:
-    """Return a significant constant in the Doppler of all static returns, m/s, or 0.
-
-    Returns in different directions distinguish it from a velocity.
-    """
-    offsets, variances = [], []
-    if folding_interval_mps(doppler_mps) is not None:
-        return 0.0  # aliased speeds hide it
-    for scan, speeds, velocity in zip(scans, doppler_mps, velocities.of_scans, strict=True):
-        used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
-        if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
-            continue
-        away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
-        columns = np.column_stack([-away, np.ones(len(away))])
-        fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
-        if rank == 4:
-            inverse = np.linalg.inv(normal_matrix(columns, columns))
-            offsets.append(float(fitted[3]))
-            variances.append(max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
-    if len(offsets) < _FEWEST_OFFSETS:
-        return 0.0
-    weights = 1 / np.array(variances)
-    mean = float((weights * offsets).sum() / weights.sum())
-    squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
-    error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
-    return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
@@ -219,9 +217,7 @@ class BodyVelocities(SensorVelocities):
     agree: bool = False
 
     @classmethod
-    def of_radars(
-        cls, rig: Rig, measured: Sequence[tuple[Ints, SensorVelocities]], times_s: Floats
-    ) -> "BodyVelocities":
+    def of_radars(cls, rig: Rig, measured: Sequence[tuple[Ints, SensorVelocities]], times_s: Floats) -> Self:
         """Build from the scans (N,) of each radar with Doppler and its velocities at them. `times_s` (F,): of all scans."""
         count, mountings = len(rig.of_scan), rig.mountings
         mean, covariance = np.zeros((count, 3)), np.tile(_ANY_MPS**2 * np.eye(3), (count, 1, 1))

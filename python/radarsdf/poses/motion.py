@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import qmc
+from typing_extensions import Self
 
 from radarsdf.arrays import Bools, Floats
 from radarsdf.poses.rigid import rotation, rotation_vector, skew, step_vectors, steps, transform
@@ -272,16 +273,14 @@ class SteadyMotion(KnownMotion):
     usual: Floats  # (2,) variances of a step given the usual rates only, m² and rad²
 
     @classmethod
-    def by(
-        cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools
-    ) -> "SteadyMotion":
+    def by(cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools) -> Self:
         """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `known` by other sources."""
         spans = spans_of(times_s, len(times_s))
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
         return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 
-    def at(self, poses: Floats) -> "SteadyMotion":
+    def at(self, poses: Floats) -> Self:
         """Predict each step of `poses` from its neighbours."""
         durations_s = self.durations_s
         rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)

@@ -174,7 +174,7 @@ def track_scans(
         checked.check_intervals()
     if imu is None and isinstance(points, Scans):
         imu = points.imu
-    compared = [_compare_doppler(checked.signed(), config, num_threads) for checked in radars]
+    compared = [_compare(checked.signed(), config, num_threads) for checked in radars]
     scans = join_radars(rig, [each for each, _ in compared])
     times, velocities = scans.times_s, scans.velocities
 
@@ -194,9 +194,7 @@ def track_scans(
     return drive, tracked, compared, inertial, scans
 
 
-def _compare_doppler(
-    checked: CheckedScans, config: FitConfig, num_threads: int
-) -> tuple[CheckedScans, Consistency]:
+def _compare(checked: CheckedScans, config: FitConfig, num_threads: int) -> tuple[CheckedScans, Consistency]:
     """Compare the Doppler of a radar with its returns within the ranges of the settings."""
     limits = config.returns
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
+from radarsdf.checks import hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.agreement import Verdict, held_out
@@ -25,7 +25,7 @@ from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut
 from radarsdf.rig import Rig
-from radarsdf.scans import Scans
+from radarsdf.scans import Scans, filled
 from radarsdf.threads import ThreadPool
 
 # Within short windows of scans, the drift is small compared with a cell. The window doubles from stage to stage.
@@ -105,12 +105,12 @@ class PosesEstimate:
             diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
 
-        def solved(more: Floats | float) -> Floats:
+        def solve(more: Floats | float) -> Floats:
             """Solve for increments (F, 6) with `more` added to the gradient."""
             right = gradient + more
             return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
 
-        return cls(poses, covariance + _by_biases(evidence, poses, solved), motions, noise, rounds)
+        return cls(poses, covariance + _by_biases(evidence, poses, solve), motions, noise, rounds)
 
 
 def _plan(num_scans: int, window: int) -> list[tuple[int, int]]:
@@ -132,15 +132,13 @@ def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> t
     return diagonal + WEAK * np.eye(6), below, gradient
 
 
-def _by_biases(
-    motions: Sequence[Motion], poses: Floats, solved: Callable[[Floats | float], Floats]
-) -> Floats:
+def _by_biases(motions: Sequence[Motion], poses: Floats, solve: Callable[[Floats | float], Floats]) -> Floats:
     """Return the covariance (F, 6, 6) of the poses due to systematic errors of all steps, given the returns."""
     # The biases are unknowns, too: the poses are eliminated (Schur complement).
     by, own = (np.concatenate(parts) for parts in zip(*(m.by_bias(poses) for m in motions), strict=True))
     if len(by) == 0:
         return np.zeros((len(poses), 6, 6))
-    moved_by = np.stack([solved(each) for each in by]) - solved(0.0)
+    moved_by = np.stack([solve(each) for each in by]) - solve(0.0)
     information = np.diag(own) + np.einsum("kfi,lfi->kl", by, moved_by)
     values, axes = np.linalg.eigh((information + information.T) / 2)
     root = np.einsum("kfi,kl->lfi", moved_by, axes / np.sqrt(1 + np.maximum(values, 0.0)))
@@ -222,10 +220,7 @@ def refine_poses(
     """
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    if isinstance(points, Scans) and poses is None:
-        poses = points.poses
-    if poses is None:
-        raise ValueError(MISSING_POSES)
+    poses = filled(points, poses=poses)[2]
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
     given, rigid = usable_poses(poses, sum(len(checked.rows) for checked in radars))
     joined = join_radars(rig, [_compare_doppler(checked, given, rig) for checked in radars])
