@@ -47,7 +47,10 @@ def test_drift_is_removed(street, refined):
     assert turns[1] < 0.9 * turns[0]
     assert 0.03 < refined.report["sigma_m"] < 0.07
     assert 0.001 < refined.report["sigma_rad"] < 0.008
-    assert refined.report["moved_m"] > 0.5 * before
+    moved = [refined.report[name] for name in ("moved_m", "moved_rad")]
+    turned_rad = np.sqrt((turned_by(refined.poses, given) ** 2).mean())
+    assert moved == pytest.approx([position_error_m(refined.poses, given), turned_rad])
+    assert moved[0] > 0.5 * before
     assert "sharper map" in refined.report["verdict"]
     assert refined.report["scans"] == 20
 

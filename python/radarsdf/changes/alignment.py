@@ -38,7 +38,6 @@ class Alignment:
     T_before_after: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) m
     covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of offsets about the `centre`
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
-    improved: bool = False  # whether the surfaces show an offset between the frames
     words: str = "The maps were taken as they are."  # the verdict in one sentence
 
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
@@ -89,7 +88,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         f"The later map was moved by {moved_m:.3f} m, {how}; "
         f"surfaces do not determine {undetermined} of 6 axes, along which its pose was kept."
     )
-    return Alignment(pose, covariance, own.centre + offset[:3], True, words)
+    return Alignment(pose, covariance, own.centre + offset[:3], words)
 
 
 @dataclass(frozen=True)

@@ -325,10 +325,7 @@ def _check_common(
     # Maps in wrong frames still agree about the ground and level floors, so level and steep surfaces are tested separately;
     # and on both sides, since a place may have been cleared.
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
-    check(
-        seen,
-        f"the maps have no surface in common: they are of other places, or in other frames. {words}",
-    )
+    check(seen, f"the maps have no surface in common: they are of other places, or in other frames. {words}")
     for name, is_level in (("level", True), ("steep", False)):
         changed, agree = np.zeros(2), np.zeros(2)
         for i, (side, of_side) in enumerate(zip(sides, kinds, strict=True)):

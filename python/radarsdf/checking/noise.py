@@ -169,15 +169,12 @@ def check_intensities(recording: Scans) -> Iterator[Finding]:
 def _outliers(outliers: Floats, usual: Floats) -> Iterator[Finding]:
     """Report outliers: repeated values mark missing measurements, single ones are faults."""
     levels, counts = np.unique(outliers, return_counts=True)
-    total = len(outliers) + len(usual)
+    total, rest = len(outliers) + len(usual), f"the others, which are {usual.min():g} to {usual.max():g}"
     for name, chosen in (("intensity_sentinel", counts > 1), ("intensity_outliers", counts == 1)):
         if chosen.any():
             most = levels[chosen][np.argsort(-counts[chosen], kind="stable")]
             named = ", ".join(f"{level:g}" for level in most[:_NAMED]) + ", …" * (len(most) > _NAMED)
-            evidence = (
-                f"{counts[chosen].sum()} of {total} intensities are {named}, far from the others, which are {usual.min():g} to "
-                f"{usual.max():g}."
-            )
+            evidence = f"{counts[chosen].sum()} of {total} intensities are {named}, far from {rest}."
             yield Finding(name, "warning", evidence)
 
 

@@ -45,7 +45,6 @@ _BY_CHANCE = 1e-3  # significance level: probability that true poses seem improv
 # Minimum relevant gain, however significant. Measured: up to 0.0006 with true poses, 0.0015 and more where a drift of 0.01 m and
 # 0.05 degrees a step is corrected.
 _LEAST_GAIN = 0.001
-_HELD_OUT = 0.2  # share of the returns
 _PLACE = 0.25  # edge of a place, median ranges: larger than single objects, near or far
 # Edge of a cell, median ranges, in which the returns of other scans indicate only that scans overlap.
 _NEARBY = 0.5
@@ -249,11 +248,6 @@ def motion_significance(scans: Sequence[Floats], firsts: Ints, steps: Floats) ->
         if min(len(scans[i]), len(scans[i + 1])) > 0
     ]
     return float(Gain.of_samples(np.array(gains), 1e-6).significance) if len(gains) >= _FEW_PAIRS else 0.0
-
-
-def held_out(count: int, seed: int) -> Bools:
-    """Return a mask (count,) of the held-out returns."""
-    return np.random.default_rng(seed).random(count) < _HELD_OUT
 
 
 @dataclass(frozen=True)

@@ -96,9 +96,8 @@ class SensorVelocities:
             if rank == 4:
                 inverse = np.linalg.inv(normal_matrix(columns, columns))
                 offsets.append(float(fitted[3]))
-                variances.append(
-                    max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2) * float(inverse[3, 3])
-                )
+                variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
+                variances.append(variance * float(inverse[3, 3]))
         if len(offsets) < _FEWEST_OFFSETS:
             return 0.0
         weights = 1 / np.array(variances)

@@ -110,9 +110,8 @@ class Gyroscope:
         # Turns that the returns hardly observe share the error of their prediction.
         unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
         if contradicted or rate >= _MOST_BIAS_RAD_S + 3 * unknown:
-            off_by = f"{np.sqrt(square / 3):.1f} standard deviations and a bias of {rate:.2f} rad/s"
-            what = f"its rates differ from the turns that the returns show by {off_by}"
-            msg = f"{what}: are they in rad/s, and in the axes of the radar?"
+            by = f"{np.sqrt(square / 3):.1f} standard deviations and a bias of {rate:.2f} rad/s"
+            msg = f"its rates differ from the turns that the returns show by {by}: are they in rad/s, and in the axes of the radar?"
             raise UnusableGyroscopeError(msg)
         prior = np.linalg.inv(self.bias.covariance).astype(np.float64)
         bias, information, _ = _fit_bias(off, durations_s, weights, prior)

@@ -177,7 +177,6 @@ def track_scans(
     compared = [_compare(checked.signed(), config, num_threads) for checked in radars]
     scans = join_radars(rig, [each for each, _ in compared])
     times, velocities = scans.times_s, scans.velocities
-
     # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
     of_radars = [each.rows for each, _ in compared if each.velocities is not None]
     radar = max(of_radars, key=len, default=np.arange(len(times)))

@@ -14,14 +14,14 @@ from radarsdf.arrays import Floats
 from radarsdf.checks import hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.agreement import Verdict, held_out
+from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import DopplerMotion
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import SensorReturns, common_planes, plane_cell_m
-from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
+from radarsdf.poses.rigid import aligned, increments, moved, steps, turned_by
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut
 from radarsdf.rig import Rig
@@ -43,6 +43,7 @@ _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
 _EXACT = 1e-3  # tolerance for differences of solutions
 # Information of a weak prior on each pose, 1/m² and 1/rad²: unobserved components are not changed.
 WEAK = 1e-4
+_HELD_OUT = 0.2  # share of the returns for the test
 _FIXED = 1e10  # information that fixes the reference pose of the covariance
 
 # Measurement of absolute poses (F, 4, 4): its Hessian (F, 6, 6) and gradient (F, 6) by increments.
@@ -240,7 +241,7 @@ def refine_poses(
         motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
     with ThreadPool(config.num_threads) as pool:
-        held = held_out(len(returns), config.seed)
+        held = np.random.default_rng(config.seed).random(len(returns)) < _HELD_OUT
         used = returns.select(~held)
         found = PosesEstimate.of(used, given, motions, cell_m, limits, pool.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
@@ -253,7 +254,8 @@ def refine_poses(
         "sigma_m": sigma_m,
         "sigma_rad": sigma_rad,
         "bias": found.motions[0].bias.tolist(),
-        **moved_by(given, found.poses),
+        "moved_m": float(np.sqrt(((found.poses - given)[:, :3, 3] ** 2).sum(axis=1).mean())),
+        "moved_rad": float(np.sqrt((turned_by(given, found.poses) ** 2).mean())),
         "noise": vars(found.noise).copy(),
         "moving": joined.moving,
         "rounds": found.rounds,
