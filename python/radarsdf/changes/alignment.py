@@ -1,5 +1,6 @@
 """Registration of two maps by their surfaces."""
 
+import contextlib
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -69,8 +70,8 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     searched = _constrained_pose(before, surface, _coarse_pose(before, surface))
     if nearer(found[0], searched[0]):
         found = searched
-    place = _place(before, after)
-    if place is not None:
+    with contextlib.suppress(Lost):
+        place = _place(before, after)
         near = surface.placed(place)
         searched = _constrained_pose(before, near, np.eye(4))
         if nearer(found[0], searched[0] @ place):
@@ -135,17 +136,14 @@ class _Surface:
         return found
 
 
-def _place(before: PlacedMap, after: PlacedMap) -> Floats | None:
+def _place(before: PlacedMap, after: PlacedMap) -> Floats:
     """Search the whole earlier surface for the later one, if its frame is another; no prior limits the offset."""
     earlier, later = (
         OrientedPoints(placed.vertices, placed.normals, float(np.nanmedian(placed.sigma_m)))
         for placed in (before, after)
     )
     index = SurfaceIndex.of_surface(earlier, earlier.centre, before.leaf_m)
-    try:
-        return search(index, later, resolve_num_threads(before.radar_map.config.num_threads))
-    except Lost:
-        return None
+    return search(index, later, resolve_num_threads(before.radar_map.config.num_threads))
 
 
 def _coarse_pose(before: PlacedMap, surface: _Surface) -> Floats:

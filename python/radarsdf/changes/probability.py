@@ -32,8 +32,7 @@ _BEHIND_CELLS = 1.5
 _CELLS_ALONG_RAY = 3.0  # mean number of the 27 cells near a place that one ray crosses
 _LEAST_SHARE, _MOST_SHARE = 1e-6, 0.5
 _MAX_ITERATIONS, _TOLERANCE = 50, 1e-4  # iterations and tolerance of the share
-# Returns of a scan in adjacent cells are correlated: this many count as one. Tuned on facade, hall and
-# forest of seed 31.
+# Returns of a scan in adjacent cells are correlated: this many count as one (tuned on facade, hall and forest of seed 31).
 _CELLS_PER_SCAN = 2.0
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)

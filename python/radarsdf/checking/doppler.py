@@ -73,14 +73,13 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
     if len(recording) < _MIN_SCANS:
         return
     by_poses = velocity_of_poses(recording.poses, knots)[scans]
-    used = (scans > 0) & (scans < len(recording) - 1)
-    used &= (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
+    inner = (scans > 0) & (scans < len(recording) - 1)
+    used = inner & (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (by_doppler[used], by_poses[used]))
     moves = used.sum() >= _MIN_SCANS
     cosine = float(np.median(np.einsum("na,na->n", a, b))) if moves else 1.0
     sign = -1.0 if cosine < -0.8 else 1.0
     if times is not None:
-        inner = (scans > 0) & (scans < len(recording) - 1)
         variances, edges = np.full(int(inner.sum()), LEAST_MPS**2), np.append(scans[inner], scans[inner][-1:])
         found = contradiction(by_poses[inner], sign * by_doppler[inner], variances, edges)
         wrong = None if found is None else found.words("the poses")

@@ -151,7 +151,6 @@ def check_intensities(recording: Scans) -> Iterator[Finding]:
     if not held.all():
         yield from _outliers(whole[~held], whole[held])
     scans = [np.asarray(recording.intensities[i], np.float64) for i in some_scans(recording)]
-    scans = [scan[np.isfinite(scan)] for scan in scans]
     scans = [scan[plausible.holds(scan)] for scan in scans]
     values = np.concatenate(scans)
     if len(values) == 0:

@@ -42,8 +42,7 @@ ERRORS = 3.0  # standard errors of a significant difference
 NEIGHBOURS = 16  # nearest neighbours of a return; those of other scans contribute to the density
 _MOST_HELD = 20_000  # maximum number of held-out returns
 _BY_CHANCE = 1e-3  # significance level: probability that true poses seem improved
-# Minimum relevant gain, however significant. Measured: up to 0.0006 with true poses, 0.0015 and more where a drift of 0.01 m and
-# 0.05 degrees a step is corrected.
+# Minimum relevant gain. Measured: with true poses up to 0.0006; where a drift of 0.01 m and 0.05 degrees a step is corrected, 0.0015.
 _LEAST_GAIN = 0.001
 _PLACE = 0.25  # edge of a place, median ranges: larger than single objects, near or far
 # Edge of a cell, median ranges, in which the returns of other scans indicate only that scans overlap.
@@ -313,9 +312,8 @@ def _gains(
     held: SensorReturns, used: SensorReturns, before: Floats, after: Floats, noise: SensorNoise
 ) -> Floats:
     """Return the increase (N,) of the log density at the held-out returns."""
-    # A nearest neighbour alone mostly reflects the sampling. The density is a sum over several, with a kernel as wide as the noise
-    # of both returns and the spacing of returns. An isolated return is clutter or a new object: the median density is added to
-    # each, so that such returns count little.
+    # A nearest neighbour alone mostly reflects the sampling. The density is a sum over several, with a kernel as wide as the noise of
+    # both returns and their spacing. Isolated returns are clutter or new objects: with the median density added, they count little.
     variances = noise.mean_variances_m2(held.ranges_m), noise.mean_variances_m2(used.ranges_m)
     densities, apart_m2 = [], 0.0
     for poses in (before, after):

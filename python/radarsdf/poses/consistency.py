@@ -196,8 +196,7 @@ def _slope(x: Floats, y: Floats) -> tuple[float, float, Floats]:
 _SAMPLED, _PAIRS = 100, 48  # returns of a scan, and maximum number of pairs of scans to compare
 _DELAYED = 24  # steps to compare with delayed ones
 _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
-# Prior deviations of velocities, share of the speed: along them, so that returns of most scenes converge from half or twice the true
-# ones, and across.
+# Prior deviations of velocities, share of the speed: along them (most scenes converge from half or twice the true ones), and across.
 _FREE_SCALE, _FREE_ACROSS = 0.15, 0.04
 _SCALES = np.geomspace(0.4, 2.5, 17)
 _SAME = len(_SCALES) // 2

@@ -20,8 +20,7 @@ from radarsdf.returns.moving import (
 )
 from radarsdf.rig import Rig
 
-# Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
-# elevations with a common error.
+# Measured (Astyx drives): errors of velocities exceed those of independent returns, as those of elevations in common do.
 LEAST_MPS = 0.02
 # Prior deviation of the vertical velocity, share of the speed, where Doppler is less precise. Slopes of roads: 0.05.
 _CLIMB = 0.1

@@ -79,17 +79,16 @@ class PosesEstimate:
         """
         poses, count, noise, motions = given, len(given), None, list(motions)
         plan, finest, spread = _plan(count, first_window), 1, np.zeros(6)
-        rounds = 0
-        for window, planned in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
+        bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
+        for rounds, (window, planned) in enumerate(bar, 1):
             cells = max(planned, finest)
             # The noise is estimated every other round: it changes slowly.
-            odd = rounds % 2 == 1
-            grid = window, cells * cell_m, noise if odd else None
-            planes, noise = common_planes(returns, poses, *grid, config, num_threads, shifted=odd)
+            even = rounds % 2 == 0
+            grid = window, cells * cell_m, noise if even else None
+            planes, noise = common_planes(returns, poses, *grid, config, num_threads, shifted=even)
             steps, inverse, inverse_below, decrement = planes.solve(
                 *_prior(motions, poses, anchor), _TOLERANCE, _MOST_ITERATIONS, True, num_threads
             )
-            rounds += 1
             coarser, spread = spread, np.log(step_variances(poses, inverse, inverse_below)).mean(axis=0)
             if rounds == len(plan) - _MOST_ROUNDS + 1 and (spread - coarser > _COARSER).any():
                 finest = _OF_ALL[-1]

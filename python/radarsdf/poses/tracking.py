@@ -168,8 +168,7 @@ def _best(scores: Floats) -> NDArray[np.intp]:
 
 
 _PASSES = 3
-# Initial priors, replaced by the drive's own rates after the first pass. With 1 rad/s, the first steps of sparse real
-# scans were wrong by up to 9 degrees.
+# Initial priors, until the drive's own rates replace them. With 1 rad/s, first steps of sparse real scans were wrong by up to 9 degrees.
 TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 # Minimum share of a step's prior variance that the returns must remove if nothing else measures the translation. Below half,
