@@ -69,8 +69,7 @@ def positions(values: ArrayLike, name: str) -> Floats:
     """Convert to finite positions (N, 3), m, in C order."""
     points: Floats = np.ascontiguousarray(real_array(values, name))
     check(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
-    within = (np.abs(points) <= MAX_POSITION_M).all()
-    check(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
+    check((np.abs(points) <= MAX_POSITION_M).all(), f"{name} must be finite, and within {MAX_POSITION_M:g} m")
     return points
 
 
@@ -90,8 +89,7 @@ def check_scan_shapes(scans: Sequence[Array]) -> None:
 
 
 def check_scan_shape(scan: Array, number: int) -> None:
-    fits = scan.ndim == 2 and scan.shape[1] == 3
-    check(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
+    check(scan.ndim == 2 and scan.shape[1] == 3, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
 def values_of_scans(

@@ -57,8 +57,7 @@ def checked_rotation(R_sensor_imu: ArrayLike) -> Floats:
     return whole[:3, :3]
 
 
-Label: TypeAlias = Hashable
-"""Name of a radar, such as that of its frame or topic."""
+Label: TypeAlias = Hashable  # name of a radar, such as that of its frame or topic
 
 
 class Mounted(NamedTuple):

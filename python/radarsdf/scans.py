@@ -1,10 +1,9 @@
 """Scans with poses, streamed from files of any size or held in memory."""
 
-import dataclasses
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, TypeAlias, TypeVar
 
@@ -21,8 +20,7 @@ _Value = TypeVar("_Value")
 # Arrays of each scan: names in `Scans`, and in `Scan`.
 _ARRAYS = {"points": "points", "intensities": "intensities", "doppler_mps": "doppler_mps", "sigmas": "sigma"}
 
-Columns: TypeAlias = dict[str, Array]
-"""(N,) each, by name."""
+Columns: TypeAlias = dict[str, Array]  # (N,) each, by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +66,7 @@ def finite_returns(scan: Scan, notes: "Notes") -> Scan:
     notes.count(what, int((~finite).sum()))
     arrays = {name: getattr(scan, name) for name in _ARRAYS.values()}
     kept: dict[str, Any] = {name: array[finite] for name, array in arrays.items() if array is not None}
-    return dataclasses.replace(scan, **kept)
+    return replace(scan, **kept)
 
 
 class Notes:

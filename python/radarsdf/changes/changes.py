@@ -265,8 +265,7 @@ def compare(
     offset, words = None, differences
     if isinstance(differences, Differences):
         changed = np.concatenate([surface.vertices[surface.kind > SAME] for surface in (gone, appeared)])
-        same = appeared.kind == SAME
-        change, of_change = differences.probability(appeared.vertices, same, changed)
+        change, of_change = differences.probability(appeared.vertices, appeared.kind == SAME, changed)
         appeared = replace(
             appeared,
             kind=np.where(of_change > _PROBABLE, REFLECTANCE_CHANGED, appeared.kind).astype(np.int8),

@@ -1,7 +1,7 @@
 """Check of scans and poses before a fit: all findings, worst first."""
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -85,7 +85,7 @@ def check(
     for label, rows in rig.scans_of_radars().items():
         if label not in misread:
             of_radar = _find(recording.select(rows), config, frames.FULL)
-            found += [dataclasses.replace(one, evidence=f"{label}: {one.evidence}") for one in of_radar]
+            found += [replace(one, evidence=f"{label}: {one.evidence}") for one in of_radar]
     if mounted and not any(one.severity == "error" and one.name != "sensor_turned" for one in found):
         found += check_mountings(of_body, config)
     return _sorted(found)

@@ -91,8 +91,7 @@ def check_duplicates(recording: Scans, numbers: Ints) -> Iterator[Finding]:
     for i, scan in enumerate(recording.points):
         if len(scan) < MIN_RETURNS:
             continue
-        key = (len(scan), *scan[0].tolist(), *scan[-1].tolist())
-        same = first_of.setdefault(key, i)
+        same = first_of.setdefault((len(scan), *scan[0].tolist(), *scan[-1].tolist()), i)
         if same != i and np.array_equal(recording.points[same], scan):
             repeated.append((same, i))
     if repeated:

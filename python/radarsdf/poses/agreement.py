@@ -1,9 +1,8 @@
 """Agreement of returns of different scans, and its significance."""
 
-import dataclasses
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -221,7 +220,7 @@ def sign_significance(
         if len(gains) < _FEW_PAIRS:
             # Returns of both scans count, mostly on the same objects: half of them are independent.
             variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
-            mean = dataclasses.replace(mean, error=np.sqrt(max(variance, 1e-12)))
+            mean = replace(mean, error=np.sqrt(max(variance, 1e-12)))
         significance = float(mean.significance)
         clear = abs(significance) > 2 * CLEAR or len(gains) >= min(_PAIRS, len(pairs))
         if clear and not turns_fast(yaws[int(significance < 0)]):

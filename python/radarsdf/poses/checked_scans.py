@@ -1,8 +1,7 @@
 """Validation of scans, times and Doppler: shapes, values and units."""
 
-import dataclasses
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -65,14 +64,14 @@ class CheckedScans:
         try:
             velocities = SensorVelocities.of(scans, speeds, times_s)
         except NoVelocityError as why:
-            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
+            return replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
         if velocities.climb_assumed:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
         if offset_mps := velocities.radial_offset_mps(scans, speeds):
             offset = f"{offset_mps:.2f} m/s are added to that of all returns"
-            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {offset}."])
+            return replace(unused, notes=[*notes, f"{NOT_USED}: {offset}."])
         each = zip(scans, speeds, velocities.of_scans, strict=True)
         static = [x[one.static | np.isnan(mps)] if one.found else x for x, mps, one in each]
         moving = sum(map(len, scans)) - sum(map(len, static))
@@ -98,8 +97,7 @@ class CheckedScans:
         for rows in rig.scans_of_radars().values():
             checked = cls.of([given[i] for i in rows], chosen(speeds, rows), times_s[rows])
             since_s = checked.times_s + (checked.begin_s - times_s[0])
-            begin_s = float(times_s[0])
-            radars.append(dataclasses.replace(checked, rows=rows, times_s=since_s, begin_s=begin_s))
+            radars.append(replace(checked, rows=rows, times_s=since_s, begin_s=float(times_s[0])))
         return rig, radars
 
     def signed(self) -> Self:
@@ -110,7 +108,7 @@ class CheckedScans:
         sign = -1 if significance < -CLEAR else 1
         velocities, yaws = self.velocities.scaled(sign), yaws[::sign]
         known = yaws if turns_fast(yaws[0]) else None
-        return dataclasses.replace(self, velocities=velocities, sign=sign, yaws=known)
+        return replace(self, velocities=velocities, sign=sign, yaws=known)
 
     def check_intervals(self) -> None:
         """Raise a ValueError if the times between scans cannot be in seconds."""

@@ -1,9 +1,8 @@
 """Consistency of Doppler and times with the motion that returns, or given poses, show, by window of scans."""
 
-import dataclasses
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm
@@ -163,8 +162,8 @@ def delay_of(
         used = followed & known[:-1] & known[1:]
         if (count := int(used.sum())) < FEWEST_STEPS:
             continue
-        delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[at])
-        turned = dataclasses.replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
+        delayed = replace(motion.velocities, mean_mps=velocities.mean_mps[at])
+        turned = replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
         later = turned.steps[:, :3, 3]
         moves = own, shown - own, later - own, seen * (later - own)
         scaled, *others = (np.einsum("fij,fj->fi", whitening, each)[used] for each in moves)
@@ -327,7 +326,7 @@ class Consistency:
                 remedy = " If it is right, leave the poses out: radarsdf.odometry"
             return None, [f"{NOT_USED}: {why}.{remedy}"]
         if self.doubts is None:
-            velocities = dataclasses.replace(velocities, common_sigma=_UNKNOWN_SCALE)
+            velocities = replace(velocities, common_sigma=_UNKNOWN_SCALE)
             return velocities, ["Assumed: the Doppler is in m/s; too few scans with motion decide its scale."]
         scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
         note = f"Assumed: the Doppler is right; scans {scans} do not decide its scale."
@@ -341,9 +340,9 @@ class Consistency:
             yaws = None
         elif self.clock is not None:
             times_s, notes = times_s - self.clock.errors_s, [*notes, *self.clock.note]
-            velocities = dataclasses.replace(velocities, clock_sigma_s=self.clock.sigma_s)
+            velocities = replace(velocities, clock_sigma_s=self.clock.sigma_s)
         notes = [*checked.notes, *notes]
-        return dataclasses.replace(checked, times_s=times_s, velocities=velocities, notes=notes, yaws=yaws)
+        return replace(checked, times_s=times_s, velocities=velocities, notes=notes, yaws=yaws)
 
 
 @dataclass(frozen=True)
@@ -375,8 +374,7 @@ class _Pairs:
                 turns.append(rotation(np.array([0.0, 0.0, yaws[i]])))
             both = [assembled(np.tile(turn, (len(shifts_m), 1, 1)), shifts_m) for turn in turns]
             apart.append(np.min([agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both], axis=0))
-        ends = [scales, 2 * scales, 2 * scales + 1]
-        ahead, back, still, shifted = np.split(np.array(apart), ends, axis=1)
+        ahead, back, still, shifted = np.split(np.array(apart), np.cumsum([scales, scales, 1]), axis=1)
         slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
         return cls(back - ahead, shifted - still, still[:, 0] - ahead[:, _SAME], along[rows], slow)
 

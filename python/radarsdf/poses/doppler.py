@@ -1,8 +1,7 @@
 """Velocities of a sensor, or of the body of several, from Doppler, and the motion between scans that they imply."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -107,7 +106,7 @@ class SensorVelocities:
 
     def select(self, rows: slice | Ints) -> Self:
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
-        return dataclasses.replace(self, of_scans=(), **columns)
+        return replace(self, of_scans=(), **columns)
 
     @property
     def usual_mps(self) -> float:
@@ -118,7 +117,7 @@ class SensorVelocities:
         """Scale by a factor with relative deviation `sigma`. -1 for a radar with positive Doppler for approaching objects."""
         mean = factor * self.mean_mps
         covariance = factor**2 * self.covariance + sigma**2 * mean[:, :, None] * mean[:, None, :]
-        return dataclasses.replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
+        return replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
 
     @property
     def of_steps(self) -> tuple[Floats, Floats, Floats]:
@@ -186,7 +185,7 @@ class DopplerMotion(KnownMotion):
         between[:, :3, :3] = rotations
         turns = rotation_vector(rotations, self.turns)
         between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None], levers)
-        return dataclasses.replace(self, steps=between)
+        return replace(self, steps=between)
 
     def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
         both = super().jacobians(poses)
@@ -252,7 +251,7 @@ class BodyVelocities(SensorVelocities):
         found = super().select(rows)
         steps = slice(rows.start, rows.stop - 1) if isinstance(rows, slice) else slice(0)
         of_radars_mps, variances = self.of_radars_mps[:, steps], self.variances[:, steps]
-        return dataclasses.replace(found, of_radars_mps=of_radars_mps, variances=variances)
+        return replace(found, of_radars_mps=of_radars_mps, variances=variances)
 
     def learnt(self, turn_rates: Sequence[MotionRate | None]) -> "BodyVelocities":
         """Remove the mean difference of each radar from the others, given turn rates (F - 1), rad/s; None: unknown."""
@@ -266,7 +265,7 @@ class BodyVelocities(SensorVelocities):
         information = self._information[:, rows]
         sums = np.einsum("kfij,kfj->ki", information, off)
         biases = np.linalg.solve(information.sum(axis=1), sums[:, :, None])[:, :, 0]
-        return dataclasses.replace(self, of_radars_mps=self.of_radars_mps - biases[:, None], agree=True)
+        return replace(self, of_radars_mps=self.of_radars_mps - biases[:, None], agree=True)
 
     @cached_property
     def _information(self) -> Floats:

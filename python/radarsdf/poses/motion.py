@@ -1,8 +1,7 @@
 """Motion between scans: priors, predictions, and measurements."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import qmc
@@ -249,7 +248,7 @@ class Motion:
         squares = ((errors - bias * spans) ** 2 + left) * weights
         sums, counts = squares.sum(axis=0).reshape(2, 3).sum(axis=1), counts.reshape(2, 3).sum(axis=1)
         found = np.maximum(sums / np.maximum(counts, 1), [_LEAST_M**2, _LEAST_RAD**2])
-        return dataclasses.replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
+        return replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
 
 
 @dataclass(frozen=True)
@@ -289,7 +288,7 @@ class SteadyMotion(KnownMotion):
         moves, turns = (0.5 * durations_s[:, None] * (r + m) for r, (m, _) in zip(rates, both, strict=True))
         variances = np.concatenate([v for _, v in both], axis=1) * 0.5 * durations_s[:, None] ** 2
         shares = np.where(np.isinf(self.shares), np.inf, variances)
-        return dataclasses.replace(self, steps=transform(turns, moves), shares=shares)
+        return replace(self, steps=transform(turns, moves), shares=shares)
 
     def evidence(self) -> Motion:
         """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""

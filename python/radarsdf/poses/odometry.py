@@ -1,9 +1,8 @@
 """Radar odometry: poses of scans from returns, Doppler and an IMU; and poses, refined or estimated, for maps and reports."""
 
-import dataclasses
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -187,7 +186,7 @@ def track_scans(
         drive, tracked = track_drive(drive, config, num_threads, progress)
     except UnusableGyroscopeError as why:
         inertial = inertial.without(why)
-        drive = dataclasses.replace(drive, gyroscope=None)
+        drive = replace(drive, gyroscope=None)
         drive, tracked = track_drive(drive, config, num_threads, progress)
     scans.notes.extend(inertial.notes)
     return drive, tracked, compared, inertial, scans
@@ -197,7 +196,7 @@ def _compare(checked: CheckedScans, config: FitConfig, num_threads: int) -> tupl
     """Compare the Doppler of a radar with its returns within the ranges of the settings."""
     limits = config.returns
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-    checked = dataclasses.replace(checked, scans=scans)
+    checked = replace(checked, scans=scans)
     if checked.velocities is None:
         return checked, Consistency()
     drive = Drive(scans, checked.times_s, checked.velocities, None, yaws=checked.yaws)

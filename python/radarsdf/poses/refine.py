@@ -1,9 +1,8 @@
 """Refinement of given poses: the joint estimate of all scans, from common planes and measured motion, and its test."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -272,9 +271,9 @@ def refine_poses(
 def _compare_doppler(checked: CheckedScans, given: Floats, rig: Rig | None) -> CheckedScans:
     """Compare the Doppler of a radar with the given poses (F, 4, 4) of all scans."""
     if checked.velocities is None or len(checked.rows) < 2:
-        return dataclasses.replace(checked, velocities=None)
+        return replace(checked, velocities=None)
     poses = given if rig is None else rig.sensor_poses(given)[checked.rows]
     if (checked.velocities.mean_mps[:-1] * steps(poses)[:, :3, 3]).sum() < 0:
-        checked = dataclasses.replace(checked, velocities=checked.velocities.scaled(-1.0))
+        checked = replace(checked, velocities=checked.velocities.scaled(-1.0))
     assert checked.velocities is not None
     return Consistency.of_poses(checked.velocities, checked.times_s, poses).corrected(checked)

@@ -1,9 +1,8 @@
 """Drives without poses: prediction of each step, registration with the previous scans, and passes that learn the motion prior."""
 
-import dataclasses
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +124,7 @@ class Tracker:
         last_R, mean = self.last.pose[:3, :3], self.last.pose @ predicted.pose(turn)
         found = self._planes.fit(scan, mean, covariance_in(predicted.covariance(turn), last_R), start)
         turn = rotation_vector(last_R.T @ found.pose[:3, :3], turn)
-        return dataclasses.replace(found, segment=self.last.segment, turn=turn)
+        return replace(found, segment=self.last.segment, turn=turn)
 
     def _search_pose(self, scan: Floats, predicted: PredictedStep, radius_m: float) -> Tracked | None:
         """Search many poses for the best, if the returns agree there significantly better than elsewhere and than by chance."""
@@ -195,8 +194,7 @@ class Drive:
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
     # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
     steady: Priors = MOVES, TURNS
-    # (2, F - 1) rough yaws between scans of a sensor that turns fast, for the sign of the Doppler and its reverse. NaN if unknown.
-    yaws: Floats | None = None
+    yaws: Floats | None = None  # as :attr:`CheckedScans.yaws`
     rig: Rig | None = None  # of several radars. The poses are those of its body
 
     def predict(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
@@ -262,7 +260,7 @@ class Drive:
             return motions
         # The error of predicted turns that few returns hardly correct is common to all steps.
         common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
-        motions[0] = dataclasses.replace(motions[0], bias_sigma=common)
+        motions[0] = replace(motions[0], bias_sigma=common)
         return [*motions, DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns)]
 
 
@@ -273,7 +271,7 @@ def track_drive(
     drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
 ) -> tuple[Drive, list[Tracked]]:
     """Track a drive in several passes; return it with its learnt motion prior, and the scans of the last pass."""
-    gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
+    gyroscope, drive = drive.gyroscope, replace(drive, gyroscope=None)
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
@@ -287,12 +285,12 @@ def track_drive(
         steady_moves = moves.learnt(move_rates, durations_s, with_errors=True)
         steady_turns = turns.learnt(turn_rates, durations_s, with_errors=True)
         turns, moves = turns.learnt(turn_rates, durations_s), moves.learnt(move_rates, durations_s)
-        drive = dataclasses.replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
+        drive = replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
         if i == 0 and isinstance(drive.velocities, BodyVelocities):
-            drive = dataclasses.replace(drive, velocities=drive.velocities.learnt(turn_rates))
+            drive = replace(drive, velocities=drive.velocities.learnt(turn_rates))
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.
-            drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(turn_rates))
+            drive = replace(drive, gyroscope=gyroscope.learnt(turn_rates))
     return drive, tracked
 
 
