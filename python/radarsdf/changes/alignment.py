@@ -72,7 +72,8 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         found = searched
     with contextlib.suppress(Lost):
         place = _place(before, after)
-        near = surface.placed(place)
+        points, normals = _transformed(surface.points, place), turned(surface.normals, place[:3, :3])
+        near = replace(surface, points=points, normals=normals, centre=points.mean(axis=0))
         searched = _constrained_pose(before, near, np.eye(4))
         if nearer(found[0], searched[0] @ place):
             found, own, T_near = searched, near, place
@@ -118,11 +119,6 @@ class _Surface:
         centre = points.mean(axis=0)
         radius_m = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
         return cls(points, normals, sigma_m, patches, centre, radius_m)
-
-    def placed(self, pose: Floats) -> "_Surface":
-        """Move the surface by a pose (4, 4)."""
-        points, normals = _transformed(self.points, pose), turned(self.normals, pose[:3, :3])
-        return replace(self, points=points, normals=normals, centre=points.mean(axis=0))
 
     def offset(self, pose: Floats) -> Floats:
         """(6,) translation of the centre, m, and rotation vector, rad, of a pose (4, 4)."""
