@@ -152,8 +152,7 @@ def interpolated_poses(at: Array, rotations: Slerp, positions: Floats) -> Floats
     """Interpolate poses (N, 4, 4): `rotations` at times `at` (N,), and positions (P, 3) at the times of the rotations linearly."""
     poses = np.tile(np.eye(4), (len(at), 1, 1))
     poses[:, :3, :3] = rotations(at).as_matrix()
-    for axis in range(3):
-        poses[:, axis, 3] = np.interp(at, rotations.times, positions[:, axis])
+    poses[:, :3, 3] = np.stack([np.interp(at, rotations.times, column) for column in positions.T], 1)
     return poses
 
 
@@ -162,13 +161,12 @@ def are_rigid(poses: Floats) -> Bools:
     rotation = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # non-finite matrices are not rigid
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        rigid: Bools = (
+        return (
             (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
             & (rotation_error < _MAX_ROTATION_ERROR)
             & (np.linalg.det(rotation) > 0)
             & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
         )
-    return rigid
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:

@@ -248,10 +248,9 @@ def compare(
         given = poses is not None or intensities is not None
         check(not given, "poses and intensities belong to new scans: a map has its own")
     check_free_space(after, "after")
-    placed = PlacedMap.of(before), PlacedMap.of(after)
-    for name, found in zip(("before", "after"), placed, strict=True):
+    earlier, later = PlacedMap.of(before), PlacedMap.of(after)
+    for name, found in (("before", earlier), ("after", later)):
         check(len(found.faces) != 0, f"{name} has no surface: fit it with more scans of the place")
-    earlier, later = placed
     alignment = align(earlier, later) if align_frames else Alignment()
     later = replace(later, T_common_map=alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)

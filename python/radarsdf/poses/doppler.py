@@ -128,10 +128,8 @@ class SensorVelocities:
     def step_covariance(self, i: int, duration_s: float) -> Floats:
         """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
         ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
-        between: Floats = ends + np.diag(self.change) * duration_s**3 / 12
-        if self.clock_sigma_s:
-            between = between + 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
-        return between
+        clock = 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
+        return ends + np.diag(self.change) * duration_s**3 / 12 + clock
 
     def step_covariances(self, durations_s: Floats) -> Floats:
         """Return the covariances (F - 1, 3, 3) of all steps, m²."""

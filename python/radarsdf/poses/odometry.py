@@ -168,11 +168,10 @@ def track_scans(
     Returns the drive, its tracked scans, the scans of each radar with that comparison, the IMU, and the scans of all radars.
     """
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
-    check(filled(points, times_s=times_s)[2] is not None, "times_s are missing: the time of each scan, s")
+    _, _, times_s, imu = filled(points, times_s=times_s, imu=imu)
+    check(times_s is not None, "times_s are missing: the time of each scan, s")
     for checked in radars:
         checked.check_intervals()
-    if imu is None and isinstance(points, Scans):
-        imu = points.imu
     compared = [_compare(checked.signed(), config, num_threads) for checked in radars]
     scans = join_radars(rig, [each for each, _ in compared])
     times, velocities = scans.times_s, scans.velocities
