@@ -4,7 +4,7 @@ from . import evaluation as evaluation
 from . import io as io
 from . import simulate as simulate
 from .changes.changes import Changes as Changes
-from .changes.compare import compare as compare
+from .changes.changes import compare as compare
 from .checking.check import check as check
 from .checking.recording import Finding as Finding
 from .config.fit_config import FitConfig as FitConfig

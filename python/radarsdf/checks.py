@@ -69,8 +69,7 @@ def positions(values: ArrayLike, name: str) -> Floats:
     """Convert to finite positions (N, 3), m, in C order."""
     points: Floats = np.ascontiguousarray(real_array(values, name))
     check(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
-    within = (np.abs(points) <= MAX_POSITION_M).all()
-    check(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
+    check((np.abs(points) <= MAX_POSITION_M).all(), f"{name} must be finite, and within {MAX_POSITION_M:g} m")
     return points
 
 
@@ -90,8 +89,7 @@ def check_scan_shapes(scans: Sequence[Array]) -> None:
 
 
 def check_scan_shape(scan: Array, number: int) -> None:
-    fits = scan.ndim == 2 and scan.shape[1] == 3
-    check(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
+    check(scan.ndim == 2 and scan.shape[1] == 3, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
 def values_of_scans(
@@ -154,8 +152,7 @@ def interpolated_poses(at: Array, rotations: Slerp, positions: Floats) -> Floats
     """Interpolate poses (N, 4, 4): `rotations` at times `at` (N,), and positions (P, 3) at the times of the rotations linearly."""
     poses = np.tile(np.eye(4), (len(at), 1, 1))
     poses[:, :3, :3] = rotations(at).as_matrix()
-    for axis in range(3):
-        poses[:, axis, 3] = np.interp(at, rotations.times, positions[:, axis])
+    poses[:, :3, 3] = np.stack([np.interp(at, rotations.times, column) for column in positions.T], 1)
     return poses
 
 
@@ -164,13 +161,12 @@ def are_rigid(poses: Floats) -> Bools:
     rotation = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # non-finite matrices are not rigid
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        rigid: Bools = (
+        return (
             (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
             & (rotation_error < _MAX_ROTATION_ERROR)
             & (np.linalg.det(rotation) > 0)
             & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
         )
-    return rigid
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:

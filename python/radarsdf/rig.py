@@ -49,18 +49,15 @@ class Imu:
 
 def checked_rotation(R_sensor_imu: ArrayLike) -> Floats:
     """Convert to a rotation (3, 3); of a rigid transform (4, 4), take its rotation."""
-    matrix: Floats = real_array(R_sensor_imu, "R_sensor_imu")
+    R: Floats = real_array(R_sensor_imu, "R_sensor_imu")
     whole = np.eye(4)
-    whole[:3, :3] = matrix[:3, :3] if matrix.shape in ((3, 3), (4, 4)) else 0.0
-    what = (
-        f"R_sensor_imu, of shape {matrix.shape}, is no rotation matrix (3, 3): orthogonal, with determinant 1"
-    )
+    whole[:3, :3] = R[:3, :3] if R.shape in ((3, 3), (4, 4)) else 0.0
+    what = f"R_sensor_imu, of shape {R.shape}, is no rotation matrix (3, 3): orthogonal, with determinant 1"
     check(are_rigid(whole[None]).all(), what)
     return whole[:3, :3]
 
 
-Label: TypeAlias = Hashable
-"""Name of a radar, such as that of its frame or topic."""
+Label: TypeAlias = Hashable  # name of a radar, such as that of its frame or topic
 
 
 class Mounted(NamedTuple):
@@ -100,9 +97,8 @@ class Rig:
         missing = sorted({str(label) for label in of_scan if label not in row})
         check(not missing, f"T_body_sensor has no mounting of {', '.join(missing)}")
         rows = np.array([row[label] for label in of_scan], np.int32)
-        if T_body_sensor is None:
-            return cls(labels, rows, None)
-        return cls(labels, rows, np.stack([*checked_mountings(T_body_sensor).values()]))
+        known = None if T_body_sensor is None else np.stack([*checked_mountings(T_body_sensor).values()])
+        return cls(labels, rows, known)
 
     @property
     def mountings(self) -> Floats:

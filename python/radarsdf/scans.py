@@ -1,10 +1,9 @@
 """Scans with poses, streamed from files of any size or held in memory."""
 
-import dataclasses
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, TypeAlias, TypeVar
 
@@ -18,10 +17,10 @@ from radarsdf.rig import Imu, Label, Rig
 _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
 
-_ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # one array per scan each
+# Arrays of each scan: names in `Scans`, and in `Scan`.
+_ARRAYS = {"points": "points", "intensities": "intensities", "doppler_mps": "doppler_mps", "sigmas": "sigma"}
 
-Columns: TypeAlias = dict[str, Array]
-"""(N,) each, by name."""
+Columns: TypeAlias = dict[str, Array]  # (N,) each, by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +64,9 @@ def finite_returns(scan: Scan, notes: "Notes") -> Scan:
         return scan
     what = "returns left out: a coordinate or the intensity is not a finite number"
     notes.count(what, int((~finite).sum()))
-    names = ("points", "intensities", "doppler_mps", "sigma")
-    columns = {name: getattr(scan, name) for name in names}
-    kept: dict[str, Any] = {name: array[finite] for name, array in columns.items() if array is not None}
-    return dataclasses.replace(scan, **kept)
+    arrays = {name: getattr(scan, name) for name in _ARRAYS.values()}
+    kept: dict[str, Any] = {name: array[finite] for name, array in arrays.items() if array is not None}
+    return replace(scan, **kept)
 
 
 class Notes:
@@ -286,17 +284,14 @@ class Scans:
     def _read(self) -> Iterator[Scan]:
         """Read the files, and keep poses and times of a complete pass."""
         assert self._source is not None
-        poses: list[Floats] = []
-        times_s: list[float | None] = []
-        sensors: list[Label | None] = []
+        found: list[tuple[Floats, float | None, Label | None]] = []
         self._notes.start_pass()
         for scan in self._source():
-            poses.append(scan.T_world_sensor)
-            times_s.append(scan.time_s)
-            sensors.append(scan.sensor)
+            found.append((scan.T_world_sensor, scan.time_s, scan.sensor))
             yield scan
         self._notes.end_pass()
-        check(poses, f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}")
+        check(found, f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}")
+        poses, times_s, sensors = zip(*found, strict=True)
         self._rig = None if None in sensors else Rig.of(sensors, self._mountings())
         self._poses = np.stack(poses) if self._rig is None else self._rig.body_poses(np.stack(poses))
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
@@ -345,12 +340,7 @@ def chosen(arrays: Sequence[Any] | None, numbers: Ints | Sequence[int]) -> list[
 
 def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
     """Collect arrays by their names in :class:`Scans`: one per scan, or None where a scan has none."""
-    return {
-        "points": [scan.points for scan in scans],
-        "intensities": _all_or_none([scan.intensities for scan in scans]),
-        "doppler_mps": _all_or_none([scan.doppler_mps for scan in scans]),
-        "sigmas": _all_or_none([scan.sigma for scan in scans]),
-    }
+    return {name: _all_or_none([getattr(scan, own) for scan in scans]) for name, own in _ARRAYS.items()}
 
 
 def _all_or_none(values: list[_Value | None]) -> list[_Value] | None:

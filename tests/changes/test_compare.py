@@ -110,7 +110,6 @@ def wall_alone(maps):
 def test_a_wall_is_aligned_only_along_its_normal(wall_alone):
     (before, after), shift_m = wall_alone, (-0.7, 0.5, 0.1)
     found = align(before, replace(after, vertices=after.vertices + shift_m))
-    assert found.improved
     moved_m = found.T_before_after[:3, 3] + (found.T_before_after[:3, :3] - np.eye(3)) @ found.centre
     np.testing.assert_allclose(moved_m, [-shift_m[0], 0, -shift_m[2]], atol=0.05)
 
@@ -119,7 +118,6 @@ def test_a_wall_is_aligned_only_along_its_normal(wall_alone):
 def test_frames_without_a_significant_offset_are_kept(wall_alone, shift_m):
     before, after = wall_alone
     found = align(before, replace(after, vertices=after.vertices + shift_m))
-    assert not found.improved
     np.testing.assert_array_equal(found.T_before_after, np.eye(4))
 
 

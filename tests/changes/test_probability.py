@@ -15,9 +15,9 @@ from radarsdf.changes.changes import (
     UNSEEN,
     ChangedSurface,
     Changes,
+    _classify,
     areas_of,
 )
-from radarsdf.changes.compare import _classify
 from radarsdf.changes.probability import (
     Differences,
     Errors,

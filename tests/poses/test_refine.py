@@ -11,7 +11,7 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.storage import checked_report
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.loops import open_loops
-from radarsdf.poses.odometry import trajectory_report
+from radarsdf.poses.odometry import PosedScans
 from radarsdf.poses.planes import SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.rigid import aligned, turned_by
 from radarsdf.returns.noise import SensorNoise
@@ -47,7 +47,10 @@ def test_drift_is_removed(street, refined):
     assert turns[1] < 0.9 * turns[0]
     assert 0.03 < refined.report["sigma_m"] < 0.07
     assert 0.001 < refined.report["sigma_rad"] < 0.008
-    assert refined.report["moved_m"] > 0.5 * before
+    moved = [refined.report[name] for name in ("moved_m", "moved_rad")]
+    turned_rad = np.sqrt((turned_by(refined.poses, given) ** 2).mean())
+    assert moved == pytest.approx([position_error_m(refined.poses, given), turned_rad])
+    assert moved[0] > 0.5 * before
     assert "sharper map" in refined.report["verdict"]
     assert refined.report["scans"] == 20
 
@@ -253,7 +256,7 @@ def test_the_verdict_is_saved_with_the_map():
     found = refined_of(1201)
     given = found.poses + 0.0
     given[:, 1, 3] = 1
-    way = json.loads(json.dumps(trajectory_report(found, given)))
+    way = json.loads(json.dumps(PosedScans.of(found, given).trajectory))
     assert len(way["scans"]) == len(way["before"]) == len(way["after"]) == len(way["sigma_m"]) == 500
     assert way["after"][-1] == [1200, 0, 0]
     assert way["before"][-1] == [1200, 1, 0]

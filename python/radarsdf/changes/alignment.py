@@ -1,5 +1,6 @@
 """Registration of two maps by their surfaces."""
 
+import contextlib
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,7 +39,6 @@ class Alignment:
     T_before_after: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) m
     covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of offsets about the `centre`
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
-    improved: bool = False  # whether the surfaces show an offset between the frames
     words: str = "The maps were taken as they are."  # the verdict in one sentence
 
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
@@ -70,9 +70,10 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     searched = _constrained_pose(before, surface, _coarse_pose(before, surface))
     if nearer(found[0], searched[0]):
         found = searched
-    place = _place(before, after)
-    if place is not None:
-        near = surface.placed(place)
+    with contextlib.suppress(Lost):
+        place = _place(before, after)
+        points, normals = _transformed(surface.points, place), turned(surface.normals, place[:3, :3])
+        near = replace(surface, points=points, normals=normals, centre=points.mean(axis=0))
         searched = _constrained_pose(before, near, np.eye(4))
         if nearer(found[0], searched[0] @ place):
             found, own, T_near = searched, near, place
@@ -89,7 +90,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         f"The later map was moved by {moved_m:.3f} m, {how}; "
         f"surfaces do not determine {undetermined} of 6 axes, along which its pose was kept."
     )
-    return Alignment(pose, covariance, own.centre + offset[:3], True, words)
+    return Alignment(pose, covariance, own.centre + offset[:3], words)
 
 
 @dataclass(frozen=True)
@@ -110,20 +111,14 @@ class _Surface:
         _, areas = across_triangles(placed.vertices, placed.faces)
         chosen = rng.choice(len(areas), min(len(areas), _MAX_POINTS), p=areas / areas.sum())
         corners, shares = placed.faces[chosen], rng.dirichlet(np.ones(3), len(chosen))
-        points, normals = (
-            np.einsum("nk,nki->ni", shares, values[corners]) for values in (placed.vertices, placed.normals)
-        )
+        points = np.einsum("nk,nki->ni", shares, placed.vertices[corners])
+        normals = np.einsum("nk,nki->ni", shares, placed.normals[corners])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
         sigma_m = np.einsum("nk,nk->n", shares, placed.sigma_m[corners])
         patches = np.unique(np.floor(points / _PATCH_M), axis=0, return_inverse=True)[1].ravel()
         centre = points.mean(axis=0)
         radius_m = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
         return cls(points, normals, sigma_m, patches, centre, radius_m)
-
-    def placed(self, pose: Floats) -> "_Surface":
-        """Move the surface by a pose (4, 4)."""
-        points, normals = _transformed(self.points, pose), turned(self.normals, pose[:3, :3])
-        return replace(self, points=points, normals=normals, centre=points.mean(axis=0))
 
     def offset(self, pose: Floats) -> Floats:
         """(6,) translation of the centre, m, and rotation vector, rad, of a pose (4, 4)."""
@@ -137,17 +132,14 @@ class _Surface:
         return found
 
 
-def _place(before: PlacedMap, after: PlacedMap) -> Floats | None:
+def _place(before: PlacedMap, after: PlacedMap) -> Floats:
     """Search the whole earlier surface for the later one, if its frame is another; no prior limits the offset."""
     earlier, later = (
         OrientedPoints(placed.vertices, placed.normals, float(np.nanmedian(placed.sigma_m)))
         for placed in (before, after)
     )
     index = SurfaceIndex.of_surface(earlier, earlier.centre, before.leaf_m)
-    try:
-        return search(index, later, resolve_num_threads(before.radar_map.config.num_threads))
-    except Lost:
-        return None
+    return search(index, later, resolve_num_threads(before.radar_map.config.num_threads))
 
 
 def _coarse_pose(before: PlacedMap, surface: _Surface) -> Floats:
@@ -197,15 +189,13 @@ def _gauss_newton(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[F
         known &= np.einsum("ni,ni->n", normals, own) >= PARALLEL
         if known.sum() < CELLS_OF_SURFACE:
             break
-        distance_m, sigma_m = distance_m[known], sigma_m[known]
+        distance_m, sigma_m, patches = distance_m[known], sigma_m[known], surface.patches[known]
         arms = there[known] - surface.centre - offset[:3]
         odds = odds_of_differences(distance_m, sigma_m, before.reach_m)
         weights = (1 - posterior(odds, share_of_changes(odds))) / sigma_m**2
         of_target, of_own = _jacobian(arms, normals[known]), _jacobian(arms, own[known])
         slope = np.einsum("ni,n,nj->ij", of_own, weights, of_target)
-        parts = np.stack(
-            [np.bincount(surface.patches[known], column * weights * distance_m) for column in of_own.T]
-        )
+        parts = np.stack([np.bincount(patches, column * weights * distance_m) for column in of_own.T])
         scatter = np.einsum("ip,jp->ij", parts, parts)
         scatter += CELLS_OF_SURFACE * np.einsum("ni,n,nj->ij", of_own, weights, of_own) + np.eye(6)
         weighted = np.linalg.solve(scatter, slope).T

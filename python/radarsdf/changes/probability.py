@@ -24,16 +24,16 @@ from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
 # Reach of distances around the surface of a field: returns scatter into the next cells.
 _REACH_CELLS = 2.0
-PARALLEL = np.cos(np.pi / 4)
-"""Smallest cosine between normals of surfaces that are about parallel: a moved surface stays parallel."""
+PARALLEL = np.cos(
+    np.pi / 4
+)  # smallest cosine between normals of surfaces that are about parallel: a moved one stays so
 _BLOCK_M = 32.0  # edge of blocks in which cells are looked up, to limit memory
 # Depth behind a surface at which the 27 cells hardly reach its visible side.
 _BEHIND_CELLS = 1.5
 _CELLS_ALONG_RAY = 3.0  # mean number of the 27 cells near a place that one ray crosses
 _LEAST_SHARE, _MOST_SHARE = 1e-6, 0.5
 _MAX_ITERATIONS, _TOLERANCE = 50, 1e-4  # iterations and tolerance of the share
-# Returns of a scan in adjacent cells are correlated: this many count as one. Tuned on facade, hall and
-# forest of seed 31.
+# Returns of a scan in adjacent cells are correlated: this many count as one (tuned on facade, hall and forest of seed 31).
 _CELLS_PER_SCAN = 2.0
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
@@ -304,13 +304,10 @@ class Differences:
         The predictions of both maps are subtracted from both drives, so views may differ a little within one view bin.
         """
         scales = [p.radar_map.intensity_scale for p in (before, after)]
-        days = [p.radar_map.view_statistics() for p in (before, after)]
-        days = [
-            replace(
-                day, points=p.to_common(day.points), directions=turned(day.directions, p.T_common_map[:3, :3])
-            )
-            for p, day in zip((before, after), days, strict=True)
-        ]
+        days = []
+        for p in (before, after):
+            day, R = p.radar_map.view_statistics(), p.T_common_map[:3, :3]
+            days.append(replace(day, points=p.to_common(day.points), directions=turned(day.directions, R)))
         if None in scales or not all(len(day.counts) for day in days):
             return "Reflectance was not compared: a map has no intensities."
         leaf_m = max(before.leaf_m, after.leaf_m)

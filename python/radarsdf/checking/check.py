@@ -1,7 +1,8 @@
 """Check of scans and poses before a fit: all findings, worst first."""
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,7 +85,7 @@ def check(
     for label, rows in rig.scans_of_radars().items():
         if label not in misread:
             of_radar = _find(recording.select(rows), config, frames.FULL)
-            found += [dataclasses.replace(one, evidence=f"{label}: {one.evidence}") for one in of_radar]
+            found += [replace(one, evidence=f"{label}: {one.evidence}") for one in of_radar]
     if mounted and not any(one.severity == "error" and one.name != "sensor_turned" for one in found):
         found += check_mountings(of_body, config)
     return _sorted(found)
@@ -139,25 +140,15 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
     numbers, points = np.arange(len(recording)), recording.points
     returns = [measured(scan) for scan in points]
     far = [too_far(*each) for each in zip(points, returns, strict=True)]
-    ranges = np.concatenate(
-        [np.linalg.norm(scan[of], axis=1) for scan, of in zip(points, returns, strict=True)]
-    )
+    ranges = np.concatenate([np.linalg.norm(x[of], axis=1) for x, of in zip(points, returns, strict=True)])
     total, most = sum(map(len, points)), ranges.max(initial=0.0)
+    distant = sum(int(mask.sum()) for mask in far)
     infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in points)
+    padding = total - len(ranges) - infinite
     for name, count, of, what in (
-        (
-            "far_returns",
-            sum(int(mask.sum()) for mask in far),
-            len(ranges),
-            "beyond 100 times the median range of their scan",
-        ),
+        ("far_returns", distant, len(ranges), "beyond 100 times the median range of their scan"),
         ("returns_not_finite", infinite, total, "not finite in their coordinates"),
-        (
-            "padding",
-            total - len(ranges) - infinite,
-            total,
-            "no measurements: 0 0 0, or consecutive copies of one point",
-        ),
+        ("padding", padding, total, "no measurements: 0 0 0, or consecutive copies of one point"),
     ):
         if count > 0:
             found.append(Finding(name, "note", f"{count} of {of} returns are {what}."))
@@ -167,19 +158,15 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         found.append(Finding("range_sentinel", "warning", evidence))
     kept = [mask & ~apart for mask, apart in zip(returns, far, strict=True)]
     if not all(mask.all() for mask in kept):
-        columns = {name: getattr(recording, name) for name in ("points", "intensities", "doppler_mps")}
-        columns = {
-            name: None
-            if arrays is None
-            else [values[mask] for values, mask in zip(arrays, kept, strict=True)]
-            for name, arrays in columns.items()
+        columns: dict[str, Any] = {
+            name: [values[mask] for values, mask in zip(arrays, kept, strict=True)]
+            for name in ("points", "intensities", "doppler_mps")
+            if (arrays := getattr(recording, name)) is not None
         }
         recording = Scans(**columns, poses=recording.poses, times_s=recording.times_s)
     empty = np.array([not mask.any() for mask in kept])
     if empty.any():
-        evidence = (
-            f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
-        )
+        evidence = f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {empty.argmax()}."
         found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
     if not empty.all():
         found += trajectory.check_rigid(recording)

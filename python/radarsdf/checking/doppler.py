@@ -11,7 +11,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Agreement, Gain, choose_pairs
 from radarsdf.poses.calibrate import calibrate
 from radarsdf.poses.consistency import Consistency, contradiction
-from radarsdf.poses.doppler import LEAST_MPS, NoVelocityError, SensorVelocities, radial_offset_mps
+from radarsdf.poses.doppler import LEAST_MPS, NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import increments, rotation, step_vectors
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
 from radarsdf.rig import Label
@@ -73,18 +73,17 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
     if len(recording) < _MIN_SCANS:
         return
     by_poses = velocity_of_poses(recording.poses, knots)[scans]
-    used = (scans > 0) & (scans < len(recording) - 1)
-    used &= (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
+    inner = (scans > 0) & (scans < len(recording) - 1)
+    used = inner & (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (by_doppler[used], by_poses[used]))
     moves = used.sum() >= _MIN_SCANS
     cosine = float(np.median(np.einsum("na,na->n", a, b))) if moves else 1.0
     sign = -1.0 if cosine < -0.8 else 1.0
     if times is not None:
-        inner = (scans > 0) & (scans < len(recording) - 1)
         variances, edges = np.full(int(inner.sum()), LEAST_MPS**2), np.append(scans[inner], scans[inner][-1:])
         found = contradiction(by_poses[inner], sign * by_doppler[inner], variances, edges)
         wrong = None if found is None else found.words("the poses")
-        yield from _compared_in_block(recording, times, sign, wrong)
+        yield from _compare_block(recording, times, sign, wrong)
     if not moves:
         return
     if sign < 0:
@@ -102,9 +101,7 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
         yield Finding("sensor_turned", "warning", evidence)
 
 
-def _compared_in_block(
-    recording: Scans, times_s: Floats, sign: float, wrong: str | None
-) -> Iterator[Finding]:
+def _compare_block(recording: Scans, times_s: Floats, sign: float, wrong: str | None) -> Iterator[Finding]:
     """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone.
 
     `wrong`: what contradicts the Doppler of all scans.
@@ -115,7 +112,7 @@ def _compared_in_block(
     speeds = [sign * np.asarray(values, np.float64) for values in (recording.doppler_mps or [])[rows]]
     with contextlib.suppress(NoVelocityError):
         velocities = SensorVelocities.of(points, speeds, times_s[rows])
-        if offset_mps := radial_offset_mps(points, speeds, velocities):
+        if offset_mps := velocities.radial_offset_mps(points, speeds):
             evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
             yield Finding("doppler_offset", "warning", evidence)
         tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])

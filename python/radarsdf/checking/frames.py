@@ -146,17 +146,16 @@ def _best(
         if good.any():
             top = int(np.argmax(np.where(good, gain.mean, -np.inf)))
             near = good & (gain.mean >= _EQUAL * gain.mean[top])
-            near &= (Gain.over(others, others[top]).significance < _NOT_BEHIND) | (
-                np.arange(len(guesses)) == top
-            )
+            near &= Gain.over(others, others[top]).significance < _NOT_BEHIND
             # Scans that move on a plane agree equally well upside down.
             near = near & upright if (near & upright).any() else near
             # The most common of the mistakes with about equal gains; of its variants, the best one.
             of_kind = near & (kinds == kinds[np.argmax(near)])
             k = int(np.argmax(np.where(of_kind, gain.mean, -np.inf)))
-            noted = noted or (guesses[k], float(gain.mean[k]), float(gain.significance[k]))
-            if _severity(float(gain.mean[k]), guesses[k].finding) == "error":
-                return guesses[k], float(gain.mean[k]), float(gain.significance[k])
+            best = guesses[k], float(gain.mean[k]), float(gain.significance[k])
+            if _severity(best[1], best[0].finding) == "error":
+                return best
+            noted = noted or best
         possible &= (gain.mean > -_MIN_GAIN) | (gain.significance > -_MIN_SIGNIFICANCE)
     return noted
 
@@ -212,9 +211,8 @@ def hypotheses(poses: Floats, pairs: Ints, *, all_axes: bool = True) -> Iterator
     `all_axes`: whether to try all 47 permutations and reflections of axes, of points and positions, or the eight most common.
     """
     motions, R, t = relative(poses, pairs), poses[:, :3, :3], poses[:, :3, 3]
-    yield Hypothesis(
-        "poses_inverted", "the poses are inverted", relative(np.linalg.inv(poses).astype(np.float64), pairs)
-    )
+    inverted = np.linalg.inv(poses).astype(np.float64)
+    yield Hypothesis("poses_inverted", "the poses are inverted", relative(inverted, pairs))
     still = np.tile(np.eye(4), (len(pairs), 1, 1))
     yield Hypothesis("points_in_world_frame", "the points are in the world frame already", still)
     rotations_by_90 = Rotation.create_group("O").as_matrix().round()

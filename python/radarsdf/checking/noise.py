@@ -151,7 +151,6 @@ def check_intensities(recording: Scans) -> Iterator[Finding]:
     if not held.all():
         yield from _outliers(whole[~held], whole[held])
     scans = [np.asarray(recording.intensities[i], np.float64) for i in some_scans(recording)]
-    scans = [scan[np.isfinite(scan)] for scan in scans]
     scans = [scan[plausible.holds(scan)] for scan in scans]
     values = np.concatenate(scans)
     if len(values) == 0:
@@ -169,15 +168,12 @@ def check_intensities(recording: Scans) -> Iterator[Finding]:
 def _outliers(outliers: Floats, usual: Floats) -> Iterator[Finding]:
     """Report outliers: repeated values mark missing measurements, single ones are faults."""
     levels, counts = np.unique(outliers, return_counts=True)
-    total = len(outliers) + len(usual)
+    total, rest = len(outliers) + len(usual), f"the others, which are {usual.min():g} to {usual.max():g}"
     for name, chosen in (("intensity_sentinel", counts > 1), ("intensity_outliers", counts == 1)):
         if chosen.any():
             most = levels[chosen][np.argsort(-counts[chosen], kind="stable")]
             named = ", ".join(f"{level:g}" for level in most[:_NAMED]) + ", …" * (len(most) > _NAMED)
-            evidence = (
-                f"{counts[chosen].sum()} of {total} intensities are {named}, far from the others, which are {usual.min():g} to "
-                f"{usual.max():g}."
-            )
+            evidence = f"{counts[chosen].sum()} of {total} intensities are {named}, far from {rest}."
             yield Finding(name, "warning", evidence)
 
 

@@ -79,9 +79,8 @@ def check_times(recording: Scans) -> Iterator[Finding]:
     times = recording.times_s
     if times is None or len(times) < 2 or ascending_times_s(recording) is not None:
         return
-    wrong = int((~(np.diff(times) > 0)).sum())
-    late = f"{wrong} of {len(times) - 1} times are not later than the one before"
-    evidence = f"{late}, or not finite: none is used."
+    wrong, count = int((~(np.diff(times) > 0)).sum()), len(times) - 1
+    evidence = f"{wrong} of {count} times are not later than the one before, or not finite: none is used."
     yield Finding("times", "warning", evidence)
 
 
@@ -92,8 +91,7 @@ def check_duplicates(recording: Scans, numbers: Ints) -> Iterator[Finding]:
     for i, scan in enumerate(recording.points):
         if len(scan) < MIN_RETURNS:
             continue
-        key = (len(scan), *scan[0].tolist(), *scan[-1].tolist())
-        same = first_of.setdefault(key, i)
+        same = first_of.setdefault((len(scan), *scan[0].tolist(), *scan[-1].tolist()), i)
         if same != i and np.array_equal(recording.points[same], scan):
             repeated.append((same, i))
     if repeated:
@@ -335,9 +333,8 @@ def check_order(recording: Scans, numbers: Ints) -> Iterator[Finding]:
         for chosen in (neighbours, crossing):
             compared = Gain.over(scores[chosen], agreement.scores(others[chosen], motions[:, chosen]))
             gain, significance = float(compared.mean[0]), float(compared.significance[0])
-            if gain < max(
-                best[0] if chosen is crossing else _EXCHANGE_GAIN, _CLOSES * excess[neighbours].mean()
-            ):
+            needed = best[0] if chosen is crossing else _EXCHANGE_GAIN
+            if gain < max(needed, _CLOSES * excess[neighbours].mean()):
                 break
         else:
             if significance >= _EXCHANGE_SIGNIFICANCE:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import radarsdf
 from radarsdf import evaluation
 from radarsdf.arrays import Floats
-from radarsdf.changes.compare import compare as compare_maps
+from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if

@@ -8,9 +8,8 @@ own frame at a scan is, for a mounting of rotation M and lever arm l,
 and the returns of all radars lie on common planes, whose offsets and tilts are eliminated (Schur complement).
 """
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -123,7 +122,7 @@ class BodyPath:
     def moved(self, step: Floats) -> "BodyPath":
         count = len(self.positions)
         path, own = step[: _PATH * count].reshape(count, _PATH), step[_PATH * count :].reshape(-1, _OWN)
-        return dataclasses.replace(
+        return replace(
             self,
             positions=self.positions + path[:, :3],
             turns=self.turns + path[:, 3:],
@@ -246,8 +245,7 @@ def estimate_mountings(
             H, g = H + of_poses.T @ of_planes @ of_poses, g + of_poses.T @ gradient
         solver = splu(H.tocsc())
         path = path.moved(-solver.solve(g))
-    units = np.eye(len(held), K * _OWN, -num_path)
-    blocks = solver.solve(units)[num_path:].reshape(K, _OWN, K, _OWN)
+    blocks = solver.solve(np.eye(len(held), K * _OWN, -num_path))[num_path:].reshape(K, _OWN, K, _OWN)
     covariance = np.stack([blocks[k, :7, k, :7] for k in range(K)])
     # Errors of velocities that change slowly pass for a delay where the speed changes slowly.
     at_s, apart_s = np.linspace(0.0, radars.times_s[-1], 2 * len(path.positions), retstep=True)
@@ -375,14 +373,14 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
         mountings = np.tile(np.eye(4), (len(labels), 1, 1))
     imu = scans.imu if imu is None else imu
     if imu is not None and imu.R_sensor_imu is not None:
-        imu = dataclasses.replace(imu, R_sensor_imu=mountings[reference, :3, :3].T @ imu.R_sensor_imu)
+        imu = replace(imu, R_sensor_imu=mountings[reference, :3, :3].T @ imu.R_sensor_imu)
     radars = [radar.signed() for radar in CheckedScans.of_radars(scans, None, None, mounted=False)[1]]
     of_radars = {labels[rig.of_scan[radar.rows[0]]]: radar for radar in radars}
     notes = [f"{label}: {note}" for label, radar in of_radars.items() for note in radar.notes]
     static = {i: scan for radar in radars for i, scan in zip(radar.rows.tolist(), radar.scans, strict=True)}
     mean_mps, whitening = _velocities(radars, len(times_s))
     first = np.flatnonzero(rig.of_scan == reference)
-    at_s, path, given, on_path = _body_path(scans, first, mountings[reference], imu, config)
+    at_s, path, given, on_path = _body_path(scans, first, times_s[first], mountings[reference], imu, config)
     interval_s = float(np.median(np.diff(times_s[first])))
     # The part that turns most.
     turned = np.append(0.0, np.cumsum(np.linalg.norm(step_vectors(path)[:, 3:], axis=1)))
@@ -424,11 +422,11 @@ def _velocities(radars: Sequence[CheckedScans], count: int) -> tuple[Floats, Flo
 
 
 def _body_path(
-    scans: Scans, rows: Ints, T_body_sensor: Floats, imu: Imu | None, config: FitConfig
+    scans: Scans, rows: Ints, times_s: Floats, T_body_sensor: Floats, imu: Imu | None, config: FitConfig
 ) -> tuple[Floats, Floats, bool, list[str]]:
-    """Return ascending times and poses of the body at scans of one radar, whether they are given, else by odometry, and notes."""
-    assert scans.times_s is not None
-    times_s, given, notes = scans.times_s[rows], True, list[str]()
+    """Return ascending times and poses of the body at scans `rows` (K,) of one radar, at `times_s` (K,), whether they are given,
+    else by odometry, and notes."""
+    given, notes = True, list[str]()
     try:
         path = scans.poses[rows]
     except ValueError:

@@ -1,23 +1,17 @@
 """Validation of scans, times and Doppler: shapes, values and units."""
 
-import dataclasses
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Self
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import MAX_TIME_S, check, real_array, values_of_scans
 from radarsdf.poses.agreement import CLEAR, sign_significance, turns_fast
-from radarsdf.poses.doppler import (
-    NOT_USED,
-    BodyVelocities,
-    NoVelocityError,
-    SensorVelocities,
-    radial_offset_mps,
-)
+from radarsdf.poses.doppler import NOT_USED, BodyVelocities, NoVelocityError, SensorVelocities
 from radarsdf.returns.moving import without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Rig
@@ -27,6 +21,7 @@ _Points: TypeAlias = Iterable[ArrayLike] | Scans
 
 _MOST_M = 500.0  # maximum median range, m. Imaging radars reach 300 m
 _INTERVALS_S = 0.002, 20.0  # limits of the median scan interval: 500 Hz, and no overlap of moving scans
+_NO_TIMES = "Doppler needs times: the time of each scan (times_s), s"
 _MOST_REACHES = 10.0  # maximum distance between two scans, median ranges: they do not overlap
 
 
@@ -36,7 +31,7 @@ class CheckedScans:
 
     rows: Ints  # (F,) numbers among the scans of all radars
     scans: list[Floats]  # (N_i, 3) static returns, sensor frame, m
-    times_s: Floats | None  # (F,) relative to the first scan of all radars
+    times_s: Floats  # (F,) relative to the first scan of all radars; numbers of scans if unknown
     begin_s: float  # time of that scan
     velocities: SensorVelocities | None  # from Doppler. None without Doppler, or if it yields no velocity
     moving: int  # number of moving returns left out
@@ -46,12 +41,9 @@ class CheckedScans:
     yaws: Floats | None = None
 
     @classmethod
-    def of(
-        cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None
-    ) -> "CheckedScans":
+    def of(cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None) -> Self:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
-        fits = doppler_mps is None or times is not None or isinstance(points, Scans)
-        check(fits, "Doppler needs times: the time of each scan (times_s), s")
+        check(doppler_mps is None or times is not None or isinstance(points, Scans), _NO_TIMES)
         _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
         range_m = median_range_m(scans)
@@ -59,29 +51,27 @@ class CheckedScans:
             range_m <= _MOST_M,
             f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m",
         )
-        rows, times_s, begin_s, notes = np.arange(len(scans)), None, 0.0, left_out.notes
-        if times is not None:
-            times_s = _checked_times(times, len(scans))
-            begin_s = float(times_s[0])
-            times_s, repeated = spread_times(times_s - begin_s)
-            if repeated:
-                notes = [*notes, f"{repeated} scans repeat the previous time: they are spread evenly."]
+        rows, notes, times_s = np.arange(len(scans)), left_out.notes, _checked_times(times, len(scans))
+        begin_s = float(times_s[0])
+        times_s, repeated = _spread_times(times_s - begin_s)
+        if repeated:
+            notes = [*notes, f"{repeated} scans repeat the previous time: they are spread evenly."]
         unused = cls(rows, scans, times_s, begin_s, None, 0, notes)
-        if doppler_mps is None or times_s is None:
+        if doppler_mps is None or times is None:
             return unused
         speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
         notes = notes if filler is None else [*notes, f"{filler}."]
         try:
             velocities = SensorVelocities.of(scans, speeds, times_s)
         except NoVelocityError as why:
-            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
+            return replace(unused, notes=[*notes, f"{NOT_USED}: {why}."])
         if velocities.climb_assumed:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
-        if offset_mps := radial_offset_mps(scans, speeds, velocities):
+        if offset_mps := velocities.radial_offset_mps(scans, speeds):
             offset = f"{offset_mps:.2f} m/s are added to that of all returns"
-            return dataclasses.replace(unused, notes=[*notes, f"{NOT_USED}: {offset}."])
+            return replace(unused, notes=[*notes, f"{NOT_USED}: {offset}."])
         each = zip(scans, speeds, velocities.of_scans, strict=True)
         static = [x[one.static | np.isnan(mps)] if one.found else x for x, mps, one in each]
         moving = sum(map(len, scans)) - sum(map(len, static))
@@ -95,39 +85,34 @@ class CheckedScans:
         times: ArrayLike | None,
         *,
         mounted: bool = True,
-    ) -> "tuple[Rig | None, list[CheckedScans]]":
+    ) -> tuple[Rig | None, list[Self]]:
         """:meth:`of` for each radar, and the rig if there are several, whose mountings must be known if `mounted`."""
         rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)
         if rig is None:
             return None, [cls.of(points, doppler_mps, times)]
-        check(
-            not mounted or rig.T_body_sensor is not None,
-            "T_body_sensor is missing: the mounting of each radar",
-        )
-        times_s = None if times_ is None else _checked_times(times_, len(given))
-        radars = []
+        known = rig.T_body_sensor is not None
+        check(known or not mounted, "T_body_sensor is missing: the mounting of each radar")
+        check(speeds is None or times_ is not None, _NO_TIMES)
+        times_s, radars = _checked_times(times_, len(given)), []
         for rows in rig.scans_of_radars().values():
-            own_s = None if times_s is None else times_s[rows]
-            checked = cls.of([given[i] for i in rows], chosen(speeds, rows), own_s)
-            if checked.times_s is not None and times_s is not None:
-                since_s = checked.times_s + (checked.begin_s - times_s[0])
-                checked = dataclasses.replace(checked, times_s=since_s, begin_s=float(times_s[0]))
-            radars.append(dataclasses.replace(checked, rows=rows))
+            checked = cls.of([given[i] for i in rows], chosen(speeds, rows), times_s[rows])
+            since_s = checked.times_s + (checked.begin_s - times_s[0])
+            radars.append(replace(checked, rows=rows, times_s=since_s, begin_s=float(times_s[0])))
         return rig, radars
 
-    def signed(self) -> "CheckedScans":
+    def signed(self) -> Self:
         """Choose the sign of the Doppler with which neighbouring scans agree."""
-        if self.velocities is None or self.times_s is None:
+        if self.velocities is None:
             return self
         significance, yaws = sign_significance(self.scans, self.velocities, self.times_s)
         sign = -1 if significance < -CLEAR else 1
         velocities, yaws = self.velocities.scaled(sign), yaws[::sign]
         known = yaws if turns_fast(yaws[0]) else None
-        return dataclasses.replace(self, velocities=velocities, sign=sign, yaws=known)
+        return replace(self, velocities=velocities, sign=sign, yaws=known)
 
     def check_intervals(self) -> None:
         """Raise a ValueError if the times between scans cannot be in seconds."""
-        if self.times_s is None or len(self.scans) < 2:
+        if len(self.scans) < 2:
             return
         interval_s = float(np.median(np.diff(self.times_s)))
         step_m = 0.0 if self.velocities is None else self.velocities.usual_mps * interval_s
@@ -146,19 +131,16 @@ def join_radars(rig: Rig | None, radars: Sequence[CheckedScans]) -> CheckedScans
         return radars[0]
     rows = np.concatenate([each.rows for each in radars])
     order, scans = np.argsort(rows), [scan for each in radars for scan in each.scans]
-    known = [each.times_s for each in radars if each.times_s is not None]
     # They need not ascend after a correction of those of one radar.
-    times_s = np.maximum.accumulate(np.concatenate(known)[order]) if known else None
+    times_s = np.maximum.accumulate(np.concatenate([each.times_s for each in radars])[order])
     measured = [(each.rows, each.velocities) for each in radars if each.velocities is not None]
-    velocities = None
-    if measured and times_s is not None:
-        velocities = BodyVelocities.of_radars(rig, measured, times_s)
+    velocities = BodyVelocities.of_radars(rig, measured, times_s) if measured else None
     scans, notes = rig.in_body([scans[i] for i in order]), [note for each in radars for note in each.notes]
     moving = sum(each.moving for each in radars)
     return CheckedScans(rows[order], scans, times_s, radars[0].begin_s, velocities, moving, notes)
 
 
-def spread_times(times_s: Floats) -> tuple[Floats, int]:
+def _spread_times(times_s: Floats) -> tuple[Floats, int]:
     """Spread repeated times (F,) evenly up to the next later one; return them with the number of repeats."""
     first = np.r_[True, np.diff(times_s) > 0]
     if first.all() or first.sum() < 2:
@@ -175,9 +157,9 @@ def median_range_m(scans: Sequence[Floats]) -> float:
     return float(np.median(ranges_m)) if len(ranges_m) else 0.0
 
 
-def _checked_times(times: ArrayLike, num_scans: int) -> Floats:
-    """Return times (F,), s. Raise a ValueError if they are invalid."""
-    times_s = real_array(times, "times_s")
+def _checked_times(times: ArrayLike | None, num_scans: int) -> Floats:
+    """Return times (F,), s, or numbers of scans without any. Raise a ValueError if they are invalid."""
+    times_s = real_array(np.arange(num_scans) if times is None else times, "times_s")
     one_each = times_s.shape == (num_scans,)
     check(one_each, f"times_s must be one for each of {num_scans} scans, not {times_s.shape}")
     ascending = (np.abs(times_s) <= MAX_TIME_S).all() and not (np.diff(times_s) < 0).any()

@@ -1,9 +1,8 @@
 """Consistency of Doppler and times with the motion that returns, or given poses, show, by window of scans."""
 
-import dataclasses
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm
@@ -163,15 +162,14 @@ def delay_of(
         used = followed & known[:-1] & known[1:]
         if (count := int(used.sum())) < FEWEST_STEPS:
             continue
-        delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[at])
-        turned = dataclasses.replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
+        delayed = replace(motion.velocities, mean_mps=velocities.mean_mps[at])
+        turned = replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
         later = turned.steps[:, :3, 3]
         moves = own, shown - own, later - own, seen * (later - own)
         scaled, *others = (np.einsum("fij,fj->fi", whitening, each)[used] for each in moves)
         # Without the part that a wrong scale explains.
-        left, change, expected = (
-            v - scaled * (v * scaled).sum() / max((scaled**2).sum(), 1e-12) for v in others
-        )
+        square = max((scaled**2).sum(), 1e-12)
+        left, change, expected = (v - scaled * (v * scaled).sum() / square for v in others)
         share, error, remaining = _slope(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
         # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
@@ -197,15 +195,12 @@ def _slope(x: Floats, y: Floats) -> tuple[float, float, Floats]:
 _SAMPLED, _PAIRS = 100, 48  # returns of a scan, and maximum number of pairs of scans to compare
 _DELAYED = 24  # steps to compare with delayed ones
 _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
-# Prior deviations of velocities, share of the speed: along them, so that returns of most scenes converge from half or twice the true
-# ones, and across.
+# Prior deviations of velocities, share of the speed: along them (most scenes converge from half or twice the true ones), and across.
 _FREE_SCALE, _FREE_ACROSS = 0.15, 0.04
 _SCALES = np.geomspace(0.4, 2.5, 17)
 _SAME = len(_SCALES) // 2
 _SAME_TRACKED = 0.05  # relative difference of tracked steps and right Doppler: simulated scenes up to 0.02
-_SHIFTS_M = np.concatenate(
-    [np.outer([sign * 4.0, sign * 2.0, sign], axis) for sign in (1, -1) for axis in np.eye(3)[:2]]
-)
+_SHIFTS_M = np.kron([[1.0], [-1.0]], np.kron(np.eye(3)[:2], [[4.0], [2.0], [1.0]]))
 # Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
 _SAME_SCALE = 1.1
 _MEASURED = 0.2  # relative difference from the Doppler beyond which confidence limits leave its scale open
@@ -331,7 +326,7 @@ class Consistency:
                 remedy = " If it is right, leave the poses out: radarsdf.odometry"
             return None, [f"{NOT_USED}: {why}.{remedy}"]
         if self.doubts is None:
-            velocities = dataclasses.replace(velocities, common_sigma=_UNKNOWN_SCALE)
+            velocities = replace(velocities, common_sigma=_UNKNOWN_SCALE)
             return velocities, ["Assumed: the Doppler is in m/s; too few scans with motion decide its scale."]
         scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
         note = f"Assumed: the Doppler is right; scans {scans} do not decide its scale."
@@ -340,15 +335,14 @@ class Consistency:
     def corrected(self, checked: CheckedScans) -> CheckedScans:
         """Return scans with the velocities and times to use, and notes."""
         assert checked.velocities is not None
-        assert checked.times_s is not None
         (velocities, notes), times_s, yaws = self.applied(checked.velocities), checked.times_s, checked.yaws
         if velocities is None:
             yaws = None
         elif self.clock is not None:
             times_s, notes = times_s - self.clock.errors_s, [*notes, *self.clock.note]
-            velocities = dataclasses.replace(velocities, clock_sigma_s=self.clock.sigma_s)
+            velocities = replace(velocities, clock_sigma_s=self.clock.sigma_s)
         notes = [*checked.notes, *notes]
-        return dataclasses.replace(checked, times_s=times_s, velocities=velocities, notes=notes, yaws=yaws)
+        return replace(checked, times_s=times_s, velocities=velocities, notes=notes, yaws=yaws)
 
 
 @dataclass(frozen=True)
@@ -380,8 +374,7 @@ class _Pairs:
                 turns.append(rotation(np.array([0.0, 0.0, yaws[i]])))
             both = [assembled(np.tile(turn, (len(shifts_m), 1, 1)), shifts_m) for turn in turns]
             apart.append(np.min([agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both], axis=0))
-        ends = [scales, 2 * scales, 2 * scales + 1]
-        ahead, back, still, shifted = np.split(np.array(apart), ends, axis=1)
+        ahead, back, still, shifted = np.split(np.array(apart), np.cumsum([scales, scales, 1]), axis=1)
         slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
         return cls(back - ahead, shifted - still, still[:, 0] - ahead[:, _SAME], along[rows], slow)
 
@@ -430,7 +423,7 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
     """Judge Doppler by window of pairs, between scans (K + 1,): return the clearest contradiction, and motions not excluded."""
     tried = list(windows_of(len(pairs)))
     level = BY_CHANCE / len(tried)
-    contradictions, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
+    against, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
     # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
     moving = pairs.select(~pairs.slow)
     pattern_moves = len(moving) >= FEWEST_STEPS and Gain.of_samples(moving.moved).excess(BY_CHANCE) < 1
@@ -455,8 +448,6 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             found += [(True, *other) for other in moving.others(level)]
             if abs(moving.farthest - 1) > _MEASURED:
                 doubts.append(OtherMotion(first, last, moving.farthest, confirmed=False))
-        contradictions += [
-            (c, excess, OtherMotion(first, last, r, c)) for c, excess, r in found if excess > 1
-        ]
-    clearest = max(contradictions, key=lambda one: one[:2])[2] if contradictions else None
+        against += [(c, excess, OtherMotion(first, last, r, c)) for c, excess, r in found if excess > 1]
+    clearest = max(against, key=lambda one: one[:2])[2] if against else None
     return clearest, tuple(doubts)

@@ -1,8 +1,7 @@
 """Velocities of a sensor, or of the body of several, from Doppler, and the motion between scans that they imply."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,8 +19,7 @@ from radarsdf.returns.moving import (
 )
 from radarsdf.rig import Rig
 
-# Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
-# elevations with a common error.
+# Measured (Astyx drives): errors of velocities exceed those of independent returns, as those of elevations in common do.
 LEAST_MPS = 0.02
 # Prior deviation of the vertical velocity, share of the speed, where Doppler is less precise. Slopes of roads: 0.05.
 _CLIMB = 0.1
@@ -73,15 +71,42 @@ class SensorVelocities:
         # Includes the noise of the velocities: an overestimate.
         squares = np.diff(mean[found], axis=0)[usual] ** 2
         change = squares.sum(axis=0) / max(durations[usual].sum(), 1e-9) + LEAST_MPS**2
-        for i in np.flatnonzero(~found):
-            mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
-            away_s = np.abs(at - times_s[i]).min()
-            covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
+        mean[~found] = interpolate(times_s[~found], at, mean[found])
+        away_s = np.abs(at - times_s[~found, None]).min(axis=1)
+        covariance[~found] = np.multiply.outer(away_s, np.diag(change)) + covariance[found].mean(axis=0)
         return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each)
+
+    def radial_offset_mps(self, scans: Sequence[Floats], doppler_mps: Sequence[Array]) -> float:
+        """Return a significant constant in the Doppler of all static returns, m/s, or 0.
+
+        Returns in different directions distinguish it from a velocity.
+        """
+        offsets, variances = [], []
+        if folding_interval_mps(doppler_mps) is not None:
+            return 0.0  # aliased speeds hide it
+        for scan, speeds, velocity in zip(scans, doppler_mps, self.of_scans, strict=True):
+            used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
+            if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
+                continue
+            away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
+            columns = np.column_stack([-away, np.ones(len(away))])
+            fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
+            if rank == 4:
+                inverse = np.linalg.inv(normal_matrix(columns, columns))
+                offsets.append(float(fitted[3]))
+                variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
+                variances.append(variance * float(inverse[3, 3]))
+        if len(offsets) < _FEWEST_OFFSETS:
+            return 0.0
+        weights = 1 / np.array(variances)
+        mean = float((weights * offsets).sum() / weights.sum())
+        squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
+        error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
+        return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
 
     def select(self, rows: slice | Ints) -> Self:
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
-        return dataclasses.replace(self, of_scans=(), **columns)
+        return replace(self, of_scans=(), **columns)
 
     @property
     def usual_mps(self) -> float:
@@ -92,54 +117,23 @@ class SensorVelocities:
         """Scale by a factor with relative deviation `sigma`. -1 for a radar with positive Doppler for approaching objects."""
         mean = factor * self.mean_mps
         covariance = factor**2 * self.covariance + sigma**2 * mean[:, :, None] * mean[:, None, :]
-        return dataclasses.replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
+        return replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
 
     @property
-    def of_steps(self) -> tuple[Floats, Floats, Floats | None]:
+    def of_steps(self) -> tuple[Floats, Floats, Floats]:
         """Velocities at the beginning and the end of steps, (F - 1, 3) each, and derivatives by turn rates, (F - 1, 3, 3) m."""
-        return self.mean_mps[:-1], self.mean_mps[1:], None
+        begin_mps, end_mps = self.mean_mps[:-1], self.mean_mps[1:]
+        return begin_mps, end_mps, np.broadcast_to(np.zeros((3, 3)), (len(end_mps), 3, 3))
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
         """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
         ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
-        between: Floats = ends + np.diag(self.change) * duration_s**3 / 12
-        if self.clock_sigma_s:
-            between = between + 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
-        return between
+        clock = 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
+        return ends + np.diag(self.change) * duration_s**3 / 12 + clock
 
     def step_covariances(self, durations_s: Floats) -> Floats:
         """Return the covariances (F - 1, 3, 3) of all steps, m²."""
         return np.stack([self.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
-
-
-def radial_offset_mps(
-    scans: Sequence[Floats], doppler_mps: Sequence[Array], velocities: SensorVelocities
-) -> float:
-    """Return a significant constant in the Doppler of all static returns, m/s, or 0.
-
-    Returns in different directions distinguish it from a velocity.
-    """
-    offsets, variances = [], []
-    if folding_interval_mps(doppler_mps) is not None:
-        return 0.0  # aliased speeds hide it
-    for scan, speeds, velocity in zip(scans, doppler_mps, velocities.of_scans, strict=True):
-        used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
-        if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
-            continue
-        away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
-        columns = np.column_stack([-away, np.ones(len(away))])
-        fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
-        if rank == 4:
-            inverse = np.linalg.inv(normal_matrix(columns, columns))
-            offsets.append(float(fitted[3]))
-            variances.append(max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
-    if len(offsets) < _FEWEST_OFFSETS:
-        return 0.0
-    weights = 1 / np.array(variances)
-    mean = float((weights * offsets).sum() / weights.sum())
-    squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
-    error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
-    return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
@@ -178,8 +172,7 @@ class DopplerMotion(KnownMotion):
         spans = spans_of(times_s, len(times_s))
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
-        measured = velocities, durations_s, turns
-        return cls(steps(poses), shares, spans, *measured, bias_sigma=common).at(poses)
+        return cls(steps(poses), shares, spans, velocities, durations_s, turns, bias_sigma=common).at(poses)
 
     def at(self, poses: Floats) -> "DopplerMotion":
         return self.turned(steps(poses)[:, :3, :3])
@@ -190,13 +183,12 @@ class DopplerMotion(KnownMotion):
         between[:, :3, :3] = rotations
         turns = rotation_vector(rotations, self.turns)
         between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None], levers)
-        return dataclasses.replace(self, steps=between)
+        return replace(self, steps=between)
 
     def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
-        both, levers = super().jacobians(poses), self.velocities.of_steps[2]
-        if levers is not None:
-            for jacobian in both:
-                jacobian[:, :3] -= levers @ jacobian[:, 3:]
+        both = super().jacobians(poses)
+        for jacobian in both:
+            jacobian[:, :3] -= self.velocities.of_steps[2] @ jacobian[:, 3:]
         return both
 
 
@@ -220,9 +212,7 @@ class BodyVelocities(SensorVelocities):
     agree: bool = False
 
     @classmethod
-    def of_radars(
-        cls, rig: Rig, measured: Sequence[tuple[Ints, SensorVelocities]], times_s: Floats
-    ) -> "BodyVelocities":
+    def of_radars(cls, rig: Rig, measured: Sequence[tuple[Ints, SensorVelocities]], times_s: Floats) -> Self:
         """Build from the scans (N,) of each radar with Doppler and its velocities at them. `times_s` (F,): of all scans."""
         count, mountings = len(rig.of_scan), rig.mountings
         mean, covariance = np.zeros((count, 3)), np.tile(_ANY_MPS**2 * np.eye(3), (count, 1, 1))
@@ -259,7 +249,7 @@ class BodyVelocities(SensorVelocities):
         found = super().select(rows)
         steps = slice(rows.start, rows.stop - 1) if isinstance(rows, slice) else slice(0)
         of_radars_mps, variances = self.of_radars_mps[:, steps], self.variances[:, steps]
-        return dataclasses.replace(found, of_radars_mps=of_radars_mps, variances=variances)
+        return replace(found, of_radars_mps=of_radars_mps, variances=variances)
 
     def learnt(self, turn_rates: Sequence[MotionRate | None]) -> "BodyVelocities":
         """Remove the mean difference of each radar from the others, given turn rates (F - 1), rad/s; None: unknown."""
@@ -273,7 +263,7 @@ class BodyVelocities(SensorVelocities):
         information = self._information[:, rows]
         sums = np.einsum("kfij,kfj->ki", information, off)
         biases = np.linalg.solve(information.sum(axis=1), sums[:, :, None])[:, :, 0]
-        return dataclasses.replace(self, of_radars_mps=self.of_radars_mps - biases[:, None], agree=True)
+        return replace(self, of_radars_mps=self.of_radars_mps - biases[:, None], agree=True)
 
     @cached_property
     def _information(self) -> Floats:

@@ -10,9 +10,8 @@ within windows of some seconds, each with a free V. The equation is linear in th
 each time offset on a grid initialises robust nonlinear least squares (Gauss-Newton).
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -75,8 +74,7 @@ class Gyroscope:
         cls, angular_velocity: Floats, at_s: Floats, times_s: Floats, bias_rad_s: float = FIRST_BIAS_RAD_S
     ) -> "Gyroscope":
         """Integrate rates (G, 3), rad/s, at ascending times (G,) between scans at `times_s` (F,)."""
-        inner = at_s[(at_s > times_s[0]) & (at_s < times_s[-1])]
-        edges = np.union1d(inner, times_s)
+        edges = np.union1d(at_s[(at_s > times_s[0]) & (at_s < times_s[-1])], times_s)
         rates = interpolate(edges, at_s, angular_velocity)
         poses = integrate_rates(edges, rates)[np.searchsorted(edges, times_s)]
         turns = rotation_vector(np.einsum("fji,fjk->fik", poses[:-1], poses[1:]))
@@ -110,16 +108,15 @@ class Gyroscope:
         # Turns that the returns hardly observe share the error of their prediction.
         unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
         if contradicted or rate >= _MOST_BIAS_RAD_S + 3 * unknown:
-            off_by = f"{np.sqrt(square / 3):.1f} standard deviations and a bias of {rate:.2f} rad/s"
-            what = f"its rates differ from the turns that the returns show by {off_by}"
-            msg = f"{what}: are they in rad/s, and in the axes of the radar?"
+            by = f"{np.sqrt(square / 3):.1f} standard deviations and a bias of {rate:.2f} rad/s"
+            msg = f"its rates differ from the turns that the returns show by {by}: are they in rad/s, and in the axes of the radar?"
             raise UnusableGyroscopeError(msg)
         prior = np.linalg.inv(self.bias.covariance).astype(np.float64)
         bias, information, _ = _fit_bias(off, durations_s, weights, prior)
         squares = (off - bias * durations_s[:, None]) ** 2 - np.einsum("fii->fi", covariance)
         noise_rad2 = np.maximum(squares * (self.noise_rad2 / noise)[:, None], 0.0).mean()
         fitted = MotionRate(bias, np.linalg.inv(information).astype(np.float64))
-        return dataclasses.replace(self, bias=fitted, noise_rad2=float(max(noise_rad2, 1e-10)))
+        return replace(self, bias=fitted, noise_rad2=float(max(noise_rad2, 1e-10)))
 
 
 def _fit_bias(
@@ -340,7 +337,7 @@ def _solve_linearly(model: _AlignmentModel) -> tuple[_AlignmentModel, Floats] | 
     R = nearest_rotation(solved[:9].reshape(3, 3).T) if imu.R_sensor_imu is None else imu.R_sensor_imu
     knots = 1 + int(np.clip((imu.times_s[-1] - imu.times_s[0]) // _KNOT_S, 1, _KNOTS))
     x = np.concatenate([np.zeros(3), solved[9:], np.zeros(6), [late[best]], np.zeros(3 * knots)])
-    return dataclasses.replace(model, R_first=R), x
+    return replace(model, R_first=R), x
 
 
 def _minimise(residuals: Callable[[Floats], Floats], x: Floats) -> tuple[Floats, Floats]:
@@ -381,10 +378,11 @@ class Inertial:
         rate = float(np.median(np.linalg.norm(imu.angular_velocity, axis=1)))
         across = rate * (0.0 if velocities is None else velocities.usual_mps)
         if rate > _MOST_RAD_S or across > _MOST_MPS2:
-            measured = f"{rate:.3g} rad/s, {across:.0f} m/s² across the trajectory"
-            why = f"the median of its rates is {measured}. They may be in deg/s: give rad/s"
-            return cls(None).without(why)
-        imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
+            measured = (
+                f"{rate:.3g} rad/s, {across:.0f} m/s² across the trajectory. They may be in deg/s: give rad/s"
+            )
+            return cls(None).without(f"the median of its rates is {measured}")
+        imu = replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             return cls(None).without("it measured before or after all scans. Are both times of one clock?")
         if velocities is not None:

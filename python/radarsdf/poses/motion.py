@@ -1,11 +1,11 @@
 """Motion between scans: priors, predictions, and measurements."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import qmc
+from typing_extensions import Self
 
 from radarsdf.arrays import Bools, Floats
 from radarsdf.poses.rigid import rotation, rotation_vector, skew, step_vectors, steps, transform
@@ -16,6 +16,7 @@ _FEWEST, _MOST = 64, 8192  # limits of the number of poses of a search
 _AT_ONCE = 1e-3  # duration of a step between two radars that measure at the same time, median steps
 _LEAST_SPAN = 0.1  # minimum duration of a step, median steps: two scans at the same time may still differ
 _YAW = 5  # component of a step
+_NO_LEVER = np.zeros((3, 3))
 _LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # minimum deviations, below the resolution of any radar
 
 
@@ -88,16 +89,16 @@ Priors = tuple[MotionPrior, MotionPrior]  # translation, rotation
 
 
 def way(
-    turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats, levers: Floats | None = None
+    turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats, levers: Floats = _NO_LEVER
 ) -> Floats:
     """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
-    and linearly changing velocity. `levers` (..., 3, 3): its derivative by the turn, if radars have lever arms, m."""
+    and linearly changing velocity. `levers` (..., 3, 3): its derivative by the turn, due to lever arms of radars, m."""
 
     def turned(share: float, vectors: Floats) -> Floats:
         return np.einsum("...ij,...j->...i", rotation(share * turn), vectors)
 
     moved = duration_s / 6 * (begin_mps + 4 * turned(0.5, 0.5 * (begin_mps + end_mps)) + turned(1.0, end_mps))
-    return moved if levers is None else moved + turned(0.5, np.einsum("...ij,...j->...i", levers, turn))
+    return moved + turned(0.5, np.einsum("...ij,...j->...i", levers, turn))
 
 
 @dataclass(frozen=True)
@@ -109,8 +110,7 @@ class PredictedStep:
     end_mps: Floats  # (3,) velocity at the second scan, in its frame
     translation_covariance: Floats  # (3, 3) of the translation given the turn, m²
     duration_s: float
-    # (3, 3) derivative of the translation by the turn, if radars have lever arms, m
-    lever: Floats | None = None
+    lever: Floats = field(default_factory=_NO_LEVER.copy)  # (3, 3) as in :func:`way`, m
 
     def pose(self, turn: Floats | None = None) -> Floats:
         """Return the pose (..., 4, 4) after rotation vectors `turn` (..., 3). None: the predicted one."""
@@ -121,8 +121,7 @@ class PredictedStep:
         """Return the covariance (6, 6) of translation and rotation vector, in the first frame, correlated by the turn."""
         turn = self.turn.mean if turn is None else turn
         # Derivative of the translation by the turn: about that of its second half.
-        swept = -skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
-        swept = swept if self.lever is None else swept + self.lever
+        swept = self.lever - skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
         both = np.concatenate([swept, np.eye(3)])
         covariance = both @ self.turn.covariance @ both.T
         covariance[:3, :3] += self.translation_covariance
@@ -249,7 +248,7 @@ class Motion:
         squares = ((errors - bias * spans) ** 2 + left) * weights
         sums, counts = squares.sum(axis=0).reshape(2, 3).sum(axis=1), counts.reshape(2, 3).sum(axis=1)
         found = np.maximum(sums / np.maximum(counts, 1), [_LEAST_M**2, _LEAST_RAD**2])
-        return dataclasses.replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
+        return replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
 
 
 @dataclass(frozen=True)
@@ -273,16 +272,14 @@ class SteadyMotion(KnownMotion):
     usual: Floats  # (2,) variances of a step given the usual rates only, m² and rad²
 
     @classmethod
-    def by(
-        cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools
-    ) -> "SteadyMotion":
+    def by(cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools) -> Self:
         """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `known` by other sources."""
         spans = spans_of(times_s, len(times_s))
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
         return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 
-    def at(self, poses: Floats) -> "SteadyMotion":
+    def at(self, poses: Floats) -> Self:
         """Predict each step of `poses` from its neighbours."""
         durations_s = self.durations_s
         rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)
@@ -291,7 +288,7 @@ class SteadyMotion(KnownMotion):
         moves, turns = (0.5 * durations_s[:, None] * (r + m) for r, (m, _) in zip(rates, both, strict=True))
         variances = np.concatenate([v for _, v in both], axis=1) * 0.5 * durations_s[:, None] ** 2
         shares = np.where(np.isinf(self.shares), np.inf, variances)
-        return dataclasses.replace(self, steps=transform(turns, moves), shares=shares)
+        return replace(self, steps=transform(turns, moves), shares=shares)
 
     def evidence(self) -> Motion:
         """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""

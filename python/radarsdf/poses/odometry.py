@@ -1,16 +1,15 @@
 """Radar odometry: poses of scans from returns, Doppler and an IMU; and poses, refined or estimated, for maps and reports."""
 
-import dataclasses
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Floats, Ints
-from radarsdf.checks import instance
+from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import ERRORS, motion_significance
 from radarsdf.poses.checked_scans import CheckedScans, join_radars
@@ -24,7 +23,7 @@ from radarsdf.poses.rigid import lengths_of_steps_m, steps
 from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.rig import Imu
-from radarsdf.scans import Scans
+from radarsdf.scans import Scans, filled
 from radarsdf.threads import ThreadPool
 
 
@@ -155,16 +154,6 @@ def odometry(
     return Odometry(poses, covariance, segments, report)
 
 
-class TrackedScans(NamedTuple):
-    """Scans of a drive, tracked without poses."""
-
-    drive: Drive
-    tracked: list[Tracked]
-    compared: list[tuple[CheckedScans, Consistency]]  # of each radar
-    inertial: Inertial
-    scans: CheckedScans  # of all radars
-
-
 def track_scans(
     points: Iterable[ArrayLike] | Scans,
     doppler_mps: Sequence[ArrayLike] | None,
@@ -173,20 +162,19 @@ def track_scans(
     config: FitConfig,
     num_threads: int,
     progress: bool | None,
-) -> TrackedScans:
-    """Check scans, compare their Doppler with their returns, and track them. Arguments and errors are those of :func:`odometry`."""
+) -> tuple[Drive, list[Tracked], list[tuple[CheckedScans, Consistency]], Inertial, CheckedScans]:
+    """Check scans, compare their Doppler with their returns, and track them. Arguments and errors are those of :func:`odometry`.
+
+    Returns the drive, its tracked scans, the scans of each radar with that comparison, the IMU, and the scans of all radars.
+    """
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
+    _, _, times_s, imu = filled(points, times_s=times_s, imu=imu)
+    check(times_s is not None, "times_s are missing: the time of each scan, s")
     for checked in radars:
-        if checked.times_s is None:
-            msg = "times_s are missing: the time of each scan, s"
-            raise ValueError(msg)
         checked.check_intervals()
-    if imu is None and isinstance(points, Scans):
-        imu = points.imu
-    compared = [_compare_doppler(checked.signed(), config, num_threads) for checked in radars]
+    compared = [_compare(checked.signed(), config, num_threads) for checked in radars]
     scans = join_radars(rig, [each for each, _ in compared])
     times, velocities = scans.times_s, scans.velocities
-    assert times is not None
     # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
     of_radars = [each.rows for each, _ in compared if each.velocities is not None]
     radar = max(of_radars, key=len, default=np.arange(len(times)))
@@ -197,20 +185,18 @@ def track_scans(
         drive, tracked = track_drive(drive, config, num_threads, progress)
     except UnusableGyroscopeError as why:
         inertial = inertial.without(why)
-        drive = dataclasses.replace(drive, gyroscope=None)
+        drive = replace(drive, gyroscope=None)
         drive, tracked = track_drive(drive, config, num_threads, progress)
     scans.notes.extend(inertial.notes)
-    return TrackedScans(drive, tracked, compared, inertial, scans)
+    return drive, tracked, compared, inertial, scans
 
 
-def _compare_doppler(
-    checked: CheckedScans, config: FitConfig, num_threads: int
-) -> tuple[CheckedScans, Consistency]:
+def _compare(checked: CheckedScans, config: FitConfig, num_threads: int) -> tuple[CheckedScans, Consistency]:
     """Compare the Doppler of a radar with its returns within the ranges of the settings."""
     limits = config.returns
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-    checked = dataclasses.replace(checked, scans=scans)
-    if checked.velocities is None or checked.times_s is None:
+    checked = replace(checked, scans=scans)
+    if checked.velocities is None:
         return checked, Consistency()
     drive = Drive(scans, checked.times_s, checked.velocities, None, yaws=checked.yaws)
     tested = Consistency.of_returns(drive, config, num_threads)
@@ -306,26 +292,6 @@ def _sigmas(covariance: Floats) -> Floats:
     return np.sqrt(np.maximum(variances, 0.0))
 
 
-def trajectory_report(
-    found: RefinedPoses | Odometry, given: Floats | None, rows: slice = slice(None)
-) -> dict[str, Any]:
-    """Return the trajectory of the scans `rows` for the report of a fit, as JSON values. `given` (F, 4, 4): original poses."""
-    poses = found.poses[rows]
-    some = np.unique(np.linspace(0, len(poses) - 1, min(_MOST, len(poses))).astype(np.int64))
-    sigmas = _sigmas(found.covariance[rows])[some]
-    return {
-        "verdict": found.report["verdict"],
-        "improved": found.improved if isinstance(found, RefinedPoses) else None,
-        "step_m": found.report.get("sigma_m"),
-        "step_rad": found.report.get("sigma_rad"),
-        "scans": some.tolist(),
-        "before": None if given is None else given[rows][some, :3, 3].tolist(),
-        "after": poses[some, :3, 3].tolist(),
-        "sigma_m": sigmas[:, 0].tolist(),
-        "sigma_rad": sigmas[:, 1].tolist(),
-    }
-
-
 @dataclass(frozen=True)
 class PosedScans:
     """Poses of the scans to fit a map to."""
@@ -334,7 +300,9 @@ class PosedScans:
     rows: slice  # the K scans among those of the drive: all, or the longest segment of odometry
     given: Floats | None = None  # (K, 4, 4) original poses, if any
     segments: int = 1
-    trajectory: dict[str, Any] | None = None  # for the report of a map. None for original poses
+    trajectory: dict[str, Any] | None = (
+        None  # for the report of a map, as JSON values. None for original poses
+    )
     sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
     notes: tuple[str, ...] = ()  # sentences on unused input
 
@@ -342,12 +310,23 @@ class PosedScans:
     def of(cls, found: RefinedPoses | Odometry, given: Floats | None = None) -> "PosedScans":
         """Build from the longest segment of odometry, or from refined poses and the original ones (F, 4, 4)."""
         rows = found.longest_segment() if isinstance(found, Odometry) else slice(0, len(found.poses))
-        kept = isinstance(found, RefinedPoses) and not found.improved
-        sigmas = None if kept else pose_sigmas(found.covariance[rows])
-        segments, notes = found.report.get("segments", 1), tuple(found.report.get("notes", ()))
-        return cls(
-            found.poses[rows], rows, given, segments, trajectory_report(found, given, rows), sigmas, notes
-        )
+        poses, covariance, report = found.poses[rows], found.covariance[rows], found.report
+        improved = found.improved if isinstance(found, RefinedPoses) else None
+        some = np.unique(np.linspace(0, len(poses) - 1, min(_MOST, len(poses))).astype(np.int64))
+        of_some = _sigmas(covariance)[some]
+        trajectory = {
+            "verdict": report["verdict"],
+            "improved": improved,
+            "step_m": report.get("sigma_m"),
+            "step_rad": report.get("sigma_rad"),
+            "scans": some.tolist(),
+            "before": None if given is None else given[rows][some, :3, 3].tolist(),
+            "after": poses[some, :3, 3].tolist(),
+            "sigma_m": of_some[:, 0].tolist(),
+            "sigma_rad": of_some[:, 1].tolist(),
+        }
+        sigmas, notes = None if improved is False else pose_sigmas(covariance), tuple(report.get("notes", ()))
+        return cls(poses, rows, given, report.get("segments", 1), trajectory, sigmas, notes)
 
     def config(self, config: FitConfig) -> FitConfig:
         """Return `config` with the errors of the poses, unless it specifies its own."""

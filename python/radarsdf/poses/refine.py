@@ -1,31 +1,30 @@
 """Refinement of given poses: the joint estimate of all scans, from common planes and measured motion, and its test."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Floats
-from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
+from radarsdf.arrays import Bools, Floats
+from radarsdf.checks import hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.agreement import Verdict, held_out
+from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import DopplerMotion
 from radarsdf.poses.loops import close_loop, open_loops, visits
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import SensorReturns, common_planes, plane_cell_m
-from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
+from radarsdf.poses.rigid import aligned, increments, moved, steps, turned_by
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut
 from radarsdf.rig import Rig
-from radarsdf.scans import Scans
+from radarsdf.scans import Scans, filled
 from radarsdf.threads import ThreadPool
 
 # Within short windows of scans, the drift is small compared with a cell. The window doubles from stage to stage.
@@ -43,6 +42,7 @@ _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
 _EXACT = 1e-3  # tolerance for differences of solutions
 # Information of a weak prior on each pose, 1/m² and 1/rad²: unobserved components are not changed.
 WEAK = 1e-4
+_HELD_OUT = 0.2  # share of the returns for the test
 _FIXED = 1e10  # information that fixes the reference pose of the covariance
 
 # Measurement of absolute poses (F, 4, 4): its Hessian (F, 6, 6) and gradient (F, 6) by increments.
@@ -78,17 +78,16 @@ class PosesEstimate:
         """
         poses, count, noise, motions = given, len(given), None, list(motions)
         plan, finest, spread = _plan(count, first_window), 1, np.zeros(6)
-        rounds = 0
-        for window, planned in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
+        bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
+        for rounds, (window, planned) in enumerate(bar, 1):
             cells = max(planned, finest)
             # The noise is estimated every other round: it changes slowly.
-            odd = rounds % 2 == 1
-            grid = window, cells * cell_m, noise if odd else None
-            planes, noise = common_planes(returns, poses, *grid, config, num_threads, shifted=odd)
+            even = rounds % 2 == 0
+            grid = window, cells * cell_m, noise if even else None
+            planes, noise = common_planes(returns, poses, *grid, config, num_threads, shifted=even)
             steps, inverse, inverse_below, decrement = planes.solve(
                 *_prior(motions, poses, anchor), _TOLERANCE, _MOST_ITERATIONS, True, num_threads
             )
-            rounds += 1
             coarser, spread = spread, np.log(step_variances(poses, inverse, inverse_below)).mean(axis=0)
             if rounds == len(plan) - _MOST_ROUNDS + 1 and (spread - coarser > _COARSER).any():
                 finest = _OF_ALL[-1]
@@ -105,12 +104,12 @@ class PosesEstimate:
             diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
 
-        def solved(more: Floats | float) -> Floats:
+        def solve(more: Floats | float) -> Floats:
             """Solve for increments (F, 6) with `more` added to the gradient."""
             right = gradient + more
             return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
 
-        return cls(poses, covariance + _by_biases(evidence, poses, solved), motions, noise, rounds)
+        return cls(poses, covariance + _by_biases(evidence, poses, solve), motions, noise, rounds)
 
 
 def estimate_closed(
@@ -126,17 +125,20 @@ def estimate_closed(
     """Estimate poses as :meth:`PosesEstimate.of`, and close the loops that are beyond the reach of its planes."""
     fixed = motions, cell_m, config, num_threads
     found = PosesEstimate.of(returns, given, *fixed, first_window, progress)
-    held = held_out(len(returns), 0)
+    held = _hold_out(len(returns), 0)
     for visit in visits(returns, found.poses):
         start = close_loop(returns, found.poses, visit, found.noise.variances, cell_m, num_threads)
         if start is None:
             continue
         closed = PosesEstimate.of(returns, start, *fixed, len(start))
-        if Verdict.of(
-            returns.select(held), returns.select(~held), found.poses, closed.poses, closed.noise
-        ).closed:
-            found = dataclasses.replace(closed, poses=aligned(closed.poses, given))
+        parts = returns.select(held), returns.select(~held)
+        if Verdict.of(*parts, found.poses, closed.poses, closed.noise).closed:
+            found = replace(closed, poses=aligned(closed.poses, given))
     return found
+
+
+def _hold_out(count: int, seed: int) -> Bools:
+    return np.random.default_rng(seed).random(count) < _HELD_OUT
 
 
 def _plan(num_scans: int, window: int) -> list[tuple[int, int]]:
@@ -158,15 +160,13 @@ def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> t
     return diagonal + WEAK * np.eye(6), below, gradient
 
 
-def _by_biases(
-    motions: Sequence[Motion], poses: Floats, solved: Callable[[Floats | float], Floats]
-) -> Floats:
+def _by_biases(motions: Sequence[Motion], poses: Floats, solve: Callable[[Floats | float], Floats]) -> Floats:
     """Return the covariance (F, 6, 6) of the poses due to systematic errors of all steps, given the returns."""
     # The biases are unknowns, too: the poses are eliminated (Schur complement).
     by, own = (np.concatenate(parts) for parts in zip(*(m.by_bias(poses) for m in motions), strict=True))
     if len(by) == 0:
         return np.zeros((len(poses), 6, 6))
-    moved_by = np.stack([solved(each) for each in by]) - solved(0.0)
+    moved_by = np.stack([solve(each) for each in by]) - solve(0.0)
     information = np.diag(own) + np.einsum("kfi,lfi->kl", by, moved_by)
     values, axes = np.linalg.eigh((information + information.T) / 2)
     root = np.einsum("kfi,kl->lfi", moved_by, axes / np.sqrt(1 + np.maximum(values, 0.0)))
@@ -248,10 +248,7 @@ def refine_poses(
     """
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    if isinstance(points, Scans) and poses is None:
-        poses = points.poses
-    if poses is None:
-        raise ValueError(MISSING_POSES)
+    poses = filled(points, poses=poses)[2]
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
     given, rigid = usable_poses(poses, sum(len(checked.rows) for checked in radars))
     joined = join_radars(rig, [_compare_doppler(checked, given, rig) for checked in radars])
@@ -267,11 +264,11 @@ def refine_poses(
         return RefinedPoses(given, np.zeros((len(given), 6, 6)), False, report)
     sigma_m, sigma_rad = np.maximum(FIRST_SIGMAS, unsteadiness(given, times)).tolist()
     motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times)]
-    if velocities is not None and times is not None:
+    if velocities is not None:
         motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
     with ThreadPool(config.num_threads) as pool:
-        held = held_out(len(returns), config.seed)
+        held = _hold_out(len(returns), config.seed)
         used = returns.select(~held)
         found = estimate_closed(used, given, motions, cell_m, limits, pool.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
@@ -284,7 +281,8 @@ def refine_poses(
         "sigma_m": sigma_m,
         "sigma_rad": sigma_rad,
         "bias": found.motions[0].bias.tolist(),
-        **moved_by(given, found.poses),
+        "moved_m": float(np.sqrt(((found.poses - given)[:, :3, 3] ** 2).sum(axis=1).mean())),
+        "moved_rad": float(np.sqrt((turned_by(given, found.poses) ** 2).mean())),
         "noise": vars(found.noise).copy(),
         "moving": joined.moving,
         "rounds": found.rounds,
@@ -301,11 +299,10 @@ def refine_poses(
 
 def _compare_doppler(checked: CheckedScans, given: Floats, rig: Rig | None) -> CheckedScans:
     """Compare the Doppler of a radar with the given poses (F, 4, 4) of all scans."""
-    if checked.velocities is None or checked.times_s is None or len(checked.rows) < 2:
-        return dataclasses.replace(checked, velocities=None)
+    if checked.velocities is None or len(checked.rows) < 2:
+        return replace(checked, velocities=None)
     poses = given if rig is None else rig.sensor_poses(given)[checked.rows]
     if (checked.velocities.mean_mps[:-1] * steps(poses)[:, :3, 3]).sum() < 0:
-        checked = dataclasses.replace(checked, velocities=checked.velocities.scaled(-1.0))
+        checked = replace(checked, velocities=checked.velocities.scaled(-1.0))
     assert checked.velocities is not None
-    assert checked.times_s is not None
     return Consistency.of_poses(checked.velocities, checked.times_s, poses).corrected(checked)

@@ -63,14 +63,6 @@ def turned_by(poses: Floats, others: Floats) -> Floats:
     return Rotation.from_matrix(between(poses, others)[:, :3, :3]).magnitude()
 
 
-def moved_by(before: Floats, after: Floats) -> dict[str, float]:
-    """Return the root mean square change of poses (F, 4, 4) for a report: `moved_m` and `moved_rad`."""
-    return {
-        "moved_m": float(np.sqrt(((after - before)[:, :3, 3] ** 2).sum(axis=1).mean())),
-        "moved_rad": float(np.sqrt((turned_by(before, after) ** 2).mean())),
-    }
-
-
 def nearest_rotation(matrix: Floats) -> Floats:
     """Return the nearest rotation (3, 3) to a matrix, not a reflection; for Σ b aᵀ, the one that best maps a to b (Kabsch)."""
     u, _, vt = np.linalg.svd(matrix)

@@ -1,9 +1,8 @@
 """Drives without poses: prediction of each step, registration with the previous scans, and passes that learn the motion prior."""
 
-import dataclasses
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,8 +78,7 @@ class Tracker:
             return self._fit_pose(scan, predicted, predicted.turn.mean)
         spread_m = predicted.spread_m(0.0)
         if spread_m <= _MOST_RADII * radius_m:
-            found = self._search_pose(scan, predicted, capture_m, radius_m)
-            if found is not None:
+            if (found := self._search_pose(scan, predicted, radius_m)) is not None:
                 return found
             # Without a clear match, a scan whose position is predicted is no more lost than one without returns.
             if spread_m <= capture_m:
@@ -126,13 +124,11 @@ class Tracker:
         last_R, mean = self.last.pose[:3, :3], self.last.pose @ predicted.pose(turn)
         found = self._planes.fit(scan, mean, covariance_in(predicted.covariance(turn), last_R), start)
         turn = rotation_vector(last_R.T @ found.pose[:3, :3], turn)
-        return dataclasses.replace(found, segment=self.last.segment, turn=turn)
+        return replace(found, segment=self.last.segment, turn=turn)
 
-    def _search_pose(
-        self, scan: Floats, predicted: PredictedStep, capture_m: float, radius_m: float
-    ) -> Tracked | None:
+    def _search_pose(self, scan: Floats, predicted: PredictedStep, radius_m: float) -> Tracked | None:
         """Search many poses for the best, if the returns agree there significantly better than elsewhere and than by chance."""
-        sample = thin(scan, _SCORED_RETURNS)
+        sample, capture_m = thin(scan, _SCORED_RETURNS), self._planes.capture_m
 
         def score(poses: Floats) -> Floats:
             return self._planes.coarse.scores(sample, np.ascontiguousarray(poses), self._planes.variances)
@@ -171,8 +167,7 @@ def _best(scores: Floats) -> NDArray[np.intp]:
 
 
 _PASSES = 3
-# Initial priors, replaced by the drive's own rates after the first pass. With 1 rad/s, the first steps of sparse real
-# scans were wrong by up to 9 degrees.
+# Initial priors, until the drive's own rates replace them. With 1 rad/s, first steps of sparse real scans were wrong by up to 9 degrees.
 TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 # Minimum share of a step's prior variance that the returns must remove if nothing else measures the translation. Below half,
@@ -199,8 +194,7 @@ class Drive:
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
     # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
     steady: Priors = MOVES, TURNS
-    # (2, F - 1) rough yaws between scans of a sensor that turns fast, for the sign of the Doppler and its reverse. NaN if unknown.
-    yaws: Floats | None = None
+    yaws: Floats | None = None  # as :attr:`CheckedScans.yaws`
     rig: Rig | None = None  # of several radars. The poses are those of its body
 
     def predict(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
@@ -219,17 +213,14 @@ class Drive:
                 gain = before[:, 2] / (before[2, 2] + YAW_STEP_RAD**2 / 4)
                 mean = turned.mean + gain * (yaw - turned.mean[2])
                 turned = MotionRate(mean, before - np.outer(gain, before[2]))
-        lever = None
-        if self.velocities is not None:
-            if isinstance(self.velocities, BodyVelocities):
-                turned = self.velocities.turn_given(turned, i - 1, duration_s)
-            covariance = self.velocities.step_covariance(i - 1, duration_s)
-            begins, ends, levers = self.velocities.of_steps
-            begin, end = begins[i - 1], ends[i - 1]
-            lever = None if levers is None else levers[i - 1]
-        else:
+        if self.velocities is None:
             velocity = self.moves.after(move, elapsed_s)
-            covariance, begin, end = velocity.integrate(duration_s).covariance, velocity.mean, velocity.mean
+            covariance = velocity.integrate(duration_s).covariance
+            return PredictedStep(turned, velocity.mean, velocity.mean, covariance, duration_s)
+        if isinstance(self.velocities, BodyVelocities):
+            turned = self.velocities.turn_given(turned, i - 1, duration_s)
+        covariance = self.velocities.step_covariance(i - 1, duration_s)
+        begin, end, lever = (each[i - 1] for each in self.velocities.of_steps)
         return PredictedStep(turned, begin, end, covariance, duration_s, lever)
 
     @property
@@ -269,7 +260,7 @@ class Drive:
             return motions
         # The error of predicted turns that few returns hardly correct is common to all steps.
         common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
-        motions[0] = dataclasses.replace(motions[0], bias_sigma=common)
+        motions[0] = replace(motions[0], bias_sigma=common)
         return [*motions, DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns)]
 
 
@@ -280,7 +271,7 @@ def track_drive(
     drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
 ) -> tuple[Drive, list[Tracked]]:
     """Track a drive in several passes; return it with its learnt motion prior, and the scans of the last pass."""
-    gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
+    gyroscope, drive = drive.gyroscope, replace(drive, gyroscope=None)
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
@@ -294,12 +285,12 @@ def track_drive(
         steady_moves = moves.learnt(move_rates, durations_s, with_errors=True)
         steady_turns = turns.learnt(turn_rates, durations_s, with_errors=True)
         turns, moves = turns.learnt(turn_rates, durations_s), moves.learnt(move_rates, durations_s)
-        drive = dataclasses.replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
+        drive = replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
         if i == 0 and isinstance(drive.velocities, BodyVelocities):
-            drive = dataclasses.replace(drive, velocities=drive.velocities.learnt(turn_rates))
+            drive = replace(drive, velocities=drive.velocities.learnt(turn_rates))
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.
-            drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(turn_rates))
+            drive = replace(drive, gyroscope=gyroscope.learnt(turn_rates))
     return drive, tracked
 
 
