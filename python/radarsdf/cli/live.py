@@ -96,9 +96,8 @@ def _due(scans: Scans, rate: float, done: Replay, stopped: Callable[[], bool]) -
     count = len(scans.points)
     times_s = np.asarray(0.1 * np.arange(count) if scans.times_s is None else scans.times_s)
     due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
-    labels = None if scans.T_body_sensor is None else scans.sensors
     begin = time.perf_counter()
-    for i in range(count):
+    for i, scan in enumerate(scans):
         now = time.perf_counter() - begin
         if rate > 0 and i + 1 < count and due_s[i + 1] <= now:
             done.dropped += 1
@@ -109,14 +108,8 @@ def _due(scans: Scans, rate: float, done: Replay, stopped: Callable[[], bool]) -
             left_s -= WAIT_STEP_S
         if stopped():
             return
-        yield Scan(
-            scans.points[i],
-            scans.poses[i],
-            None if scans.intensities is None else scans.intensities[i],
-            None if scans.doppler_mps is None else scans.doppler_mps[i],
-            float(times_s[i]),
-            sensor=None if labels is None else labels[i],
-        )
+        sensor = None if scans.T_body_sensor is None else scan.sensor
+        yield replace(scan, T_world_sensor=scans.poses[i], time_s=float(times_s[i]), sensor=sensor)
 
 
 def live(given: Namespace, results: Results) -> None:
