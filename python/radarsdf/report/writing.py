@@ -99,13 +99,8 @@ class Subject:
             truth = truth[((truth >= low) & (truth <= high)).all(axis=1)]
         return truth if len(truth) else None
 
-    def nearest_truth(self, vertices: ArrayLike) -> tuple[Floats, Any]:
-        """Distances (V,), m, to the nearest ground-truth points, which must exist, and their rows."""
-        distance_m, rows = self._truth_tree.query(vertices, workers=resolve_num_threads(0))
-        return distance_m, rows
-
     @cached_property
-    def _truth_tree(self) -> Any:
+    def truth_tree(self) -> Any:
         return cKDTree(self.ground_truth)
 
     def picture(self, values: Array, label: str, scale: Scale) -> dict[str, Any]:
@@ -153,32 +148,21 @@ def write_changes_report(
     surface = None
     if len(mesh.faces):
         colors = colors_of(mesh.vertex_attributes["kind"])
-        vertices = np.asarray(mesh.vertices, np.float64)
-        local = vertices - vertices.mean(axis=0)
-        surface = {"scene": scene(local, mesh.faces, colors), "views": views(mesh, colors)}
+        surface = _pictures(mesh, colors, np.asarray(mesh.vertices, np.float64).mean(axis=0))
     values = {"report": changes.report, "regions": regions, "kinds": [NAMES[kind] for kind in CHANGED]}
     return _write_page(path, "changes.html", names=names, surface=surface, key=MEANING, **values)
 
 
 def surface_values(subject: Subject) -> dict[str, Any] | None:
     """Values of the surface section, or None if there is no surface."""
-    mesh, spacing_m = subject.shown
+    mesh, _ = subject.shown
     if len(mesh.faces) == 0:
         return None
     colors, legend = _colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
     origin = subject.radar_map.origin
     sensors = None if subject.scans is None else subject.scans.sensor_poses[:, :3, 3] - origin
-    return {
-        "scene": scene(
-            np.asarray(mesh.vertices, np.float64) - origin, mesh.faces, colors, sensors, subject.explained
-        ),
-        "explained": subject.explained is not None,
-        "legend": legend,
-        "views": views(mesh, colors),
-        "threshold": Threshold.of_mesh(subject.mesh.metadata),
-        "shown_triangles": len(mesh.faces),
-        "spacing_m": spacing_m,
-    }
+    values = {"legend": legend, "threshold": Threshold.of_mesh(subject.mesh.metadata)}
+    return values | _pictures(mesh, colors, origin, sensors, subject.explained)
 
 
 def error_values(subject: Subject) -> dict[str, Any] | None:
@@ -187,7 +171,7 @@ def error_values(subject: Subject) -> dict[str, Any] | None:
     if truth is None or len(mesh.faces) == 0:
         return None
     metrics = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
-    shown_m, _ = subject.nearest_truth(subject.shown[0].vertices)
+    shown_m, _ = subject.truth_tree.query(subject.shown[0].vertices, workers=resolve_num_threads(0))
     pictured = subject.picture(shown_m, "distance to the truth, m", Scale(0.0, _MATCH_M))
     return {"metrics": metrics, **pictured}
 
@@ -214,7 +198,7 @@ def _calibration(subject: Subject, sigma_m: Floats) -> dict[str, Any] | None:
     if truth is None:
         return None
     vertices = np.asarray(mesh.vertices, np.float64)
-    distance_m, nearest = subject.nearest_truth(vertices)
+    distance_m, nearest = subject.truth_tree.query(vertices, workers=resolve_num_threads(0))
     error_m = ((truth[nearest] - vertices) * np.asarray(mesh.vertex_normals)).sum(axis=1)
     error_m[distance_m > _MATCH_M] = np.nan
     if np.count_nonzero(np.isfinite(error_m) & np.isfinite(sigma_m)) < _MIN_MATCHES:
@@ -313,9 +297,11 @@ def _colored(
     return scale(values), {"label": label, "scale": scale}
 
 
-def views(mesh: Any, colors: Bytes) -> dict[str, bytes]:
-    """Render a mesh with vertex colours (V, 3) from each of its sides, by name."""
-    return {name: _picture(mesh, colors, *side) for name, side in _SIDES.items()}
+def _pictures(mesh: Any, colors: Bytes, origin: Floats, *sensors: Floats | None) -> dict[str, Any]:
+    """Show a mesh with vertex colours (V, 3) in a :func:`scene` around `origin`, and from each of its sides, by name."""
+    local = np.asarray(mesh.vertices, np.float64) - origin
+    views = {name: _picture(mesh, colors, *side) for name, side in _SIDES.items()}
+    return {"scene": scene(local, mesh.faces, colors, *sensors), "views": views}
 
 
 def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:

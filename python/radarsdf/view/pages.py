@@ -65,7 +65,6 @@ class Viewer(Page):
         scans: Scans | None = None,
         *,
         voxel_size: float = 0.1,
-        max_vertices: int = 500_000,
         host: str = "127.0.0.1",
         port: int | None = None,
         explained: Floats | None = None,
@@ -73,7 +72,7 @@ class Viewer(Page):
     ) -> None:
         super().__init__(host, port)
         self._map = radar_map
-        self.surface = ShownSurface.of(radar_map, voxel_size, max_vertices=max_vertices, **wanted)
+        self.surface = ShownSurface.of(radar_map, voxel_size, max_vertices=_MAX_VERTICES, **wanted)
         self._start()
         try:
             self._fill(scans, explained)

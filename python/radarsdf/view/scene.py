@@ -59,7 +59,6 @@ class Painter:
         self.newest = state  # may not be drawn yet
         self._changed = threading.Condition()
         self._pending, self._stopped = True, False
-        self._ended = threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="radarsdf view", daemon=True)
         self._thread.start()
@@ -73,8 +72,8 @@ class Painter:
 
     def wait(self) -> None:
         """Wait for the thread to end. Raises the error that ended it."""
-        while not self._ended.wait(WAIT_STEP_S):
-            pass
+        while self._thread.is_alive():
+            self._thread.join(WAIT_STEP_S)
         if self._error is not None:
             raise self._error
 
@@ -101,8 +100,6 @@ class Painter:
                     self._canvas.show_mesh(state, self._superseded)
         except BaseException as error:  # noqa: BLE001 - `wait` raises it
             self._error = error
-        finally:
-            self._ended.set()
 
 
 class Canvas:
@@ -128,7 +125,7 @@ class Canvas:
         self.sent = 0  # number of meshes so far
         self.faces = surface.faces  # (F, 3) visible triangles, rows of the vertices
         self.coarse = False  # whether the cloud is shown
-        self.node: Any = server.scene.add_frame("/surface", show_axes=False)  # the parent of mesh and cloud
+        server.scene.add_frame("/surface", show_axes=False)  # the parent of mesh and cloud
         self._cloud: Any = None
         if any(quantity.of_sensor for quantity in quantities.values()):
             self._cloud = server.scene.add_point_cloud(
