@@ -295,7 +295,8 @@ def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path],
 def _listed_times(path: Path, notes: Notes) -> list[float]:
     """Times, s, of a file with one line per scan, in the unit of their column's name, if it has one."""
     table = read_numbers(path)
-    names = next((head for head in reversed(read_table(path).heads) if len(head) == table.shape[1]), [""])
+    heads, _ = read_table(path)
+    names = next((head for head in reversed(heads) if len(head) == table.shape[1]), [""])
     with reading(path, "a list of times"):
         times = scaled(table[:, -1], names[-1], "time")
     times = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else times

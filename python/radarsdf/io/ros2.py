@@ -354,13 +354,10 @@ class Subscription:
         self.unposed = find
         self._await_poses()
         self._assumed = self._is_assumed()
-        known, mounted = self._poses.known(), self._mounted()
+        known = self._poses.known()
         for line in () if self.unposed else known.notes:
             request.notes.add(line)
-        # By topic, of several radars.
-        self.T_body_sensor: dict[Label, Floats] | None = (
-            mounted if len(self._topics) > 1 and mounted else None
-        )
+        self.T_body_sensor = self._mounted() or None
         self.world = request.world_frame or "map"
         if not self.unposed and self._frames:
             root = known.tree.chain(next(iter(self._frames.values())))[-1]
@@ -415,10 +412,10 @@ class Subscription:
         return UNPOSED if self.unposed else self._poses.known().find(frame)
 
     def _mounted(self) -> dict[Label, Floats]:
-        """T_body_sensor by topic; empty if TF does not mount all radars on one body."""
+        """T_body_sensor by topic, of several radars; empty if TF does not mount all of them on one body."""
         frames = dict(self._frames)
         _, mounted = self._poses.known().tree.mountings([*frames.values()] or [""])
-        complete = len(mounted) == len(set(frames.values()))
+        complete = len(self._topics) > 1 and len(mounted) == len(set(frames.values()))
         return {topic: mounted[frame] for topic, frame in frames.items()} if complete else {}
 
     def _await_poses(self) -> None:
@@ -441,16 +438,12 @@ class Subscription:
 
     def _missing(self, *, late: bool) -> str:
         """Return what is missing for the poses of the scans. Only `late`, it is certain that TF has none."""
-        known, several = self._poses.known(), len(self._topics) > 1
-        if (
-            late
-            and self._request.pose_topic is None
-            and isinstance(known.error, NoPoses)
-            and not self.unposed
-        ):
+        known = self._poses.known()
+        without = self._request.pose_topic is None and isinstance(known.error, NoPoses)
+        if late and without and not self.unposed:
             self.unposed = True
             self._request.notes.add("TF has no poses of the radar: they are estimated from its returns")
-        if several and (self.unposed or known.topic) and not self._mounted():
+        if len(self._topics) > 1 and (self.unposed or known.topic) and not self._mounted():
             return f"static transforms that mount {', '.join(self._frames.values())} on one body"
         if self.unposed:
             return ""

@@ -5,7 +5,6 @@ import re
 from bisect import bisect
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy import constants
@@ -57,17 +56,11 @@ _LENGTHS, _TIMES = _FACTORS["length"].items(), _FACTORS["time"].items()
 _FACTORS["speed"] |= {f"{length}/{time}": a / b for length, a in _LENGTHS for time, b in _TIMES}
 
 
-class Table(NamedTuple):
-    """Table of R rows of numbers in a text file."""
-
-    heads: list[list[str]]  # words of the lines and comments above the rows: one may name the columns
-    values: Floats  # (R, W), NaN for words that are not numbers, and for rows of another width
-
-
-def read_table(path: Path) -> Table:
+def read_table(path: Path) -> tuple[list[list[str]], Floats]:
     """Read a text file with one row of numbers per line, separated by commas, semicolons, tabs or spaces.
 
-    Comments begin with ``#``, ``//`` or ``%``; decimal commas are read if semicolons separate the numbers. The first
+    Return the words of each line and comment above the rows, one of which may name the columns, and the values (R, W):
+    NaN for words that are not numbers, and for rows of another width. Comments begin with ``#``, ``//`` or ``%``; decimal commas are read if semicolons separate the numbers. The first
     line with a number is the first row. Raises a ValueError if most rows have words that are not numbers.
     """
     heads: list[list[str]] = []
@@ -86,7 +79,7 @@ def read_table(path: Path) -> Table:
                 continue
         if bare:
             rows.append(bare)
-    return Table(heads, _values(rows) if rows else np.zeros((0, len(heads[-1]) if heads else 0)))
+    return heads, _values(rows) if rows else np.zeros((0, len(heads[-1]) if heads else 0))
 
 
 def _values(rows: list[str]) -> Floats:
@@ -114,7 +107,7 @@ def _values(rows: list[str]) -> Floats:
 def read_numbers(path: Path, columns: int | None = None) -> Floats:
     """Read a table of finite numbers (R, columns) from a text file; None: any number of columns."""
     with reading(path, f"a table of {columns or 'any number of'} columns of finite numbers"):
-        values = read_table(path).values
+        _, values = read_table(path)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         check(len(bad) == 0, f"row {bad[:1]} has other values, or another number of columns")
         check(columns in (None, values.shape[1]), f"it has {values.shape[1]}")
