@@ -1,7 +1,7 @@
 """The command line: ``radarsdf COMMAND``.
 
-`options` lists the commands and their options, and `results` prints what they find; the other modules are the commands. They
-import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
+`options` describes the commands and their options, and `results` prints what they find; each command is a function of the other
+modules. They import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
 """
 
 import io

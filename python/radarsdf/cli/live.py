@@ -113,7 +113,6 @@ def _due(scans: Scans, rate: float, done: Replay, stopped: Callable[[], bool]) -
 
 
 def live(given: Namespace, results: Results) -> None:
-    """Replay the scans or map those of running topics, report whether the map kept up, and write it."""
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
     request = request_of_topics(given)
     out, trajectory = given.out, given.trajectory

@@ -45,7 +45,6 @@ _LISTED = 10  # regions, largest first
 
 
 def mesh(given: Namespace, results: Results) -> None:
-    """Extract the mesh, write it, and draw a picture if asked for."""
     out, drawing = given.out, given.picture
     checked_suffix(out, MESH_SUFFIXES, "meshes")
     check_outputs([out, drawing], [given.map])
@@ -60,7 +59,6 @@ def mesh(given: Namespace, results: Results) -> None:
 
 
 def evaluate(given: Namespace, results: Results) -> None:
-    """Print the errors of the surface, the intensities, or both."""
     mesh_file, truth, holdout = given.what, given.scans, given.holdout
     radar_map = load_map(mesh_file) if is_map(mesh_file) else None
     if radar_map is None:
@@ -109,7 +107,6 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
 
 
 def render(given: Namespace, results: Results) -> None:
-    """Predict scans and write them."""
     out, suffix = given.out, given.out.suffix.lower()
     refuse_if(suffix not in _VIEW_SUFFIXES, f"{out}: a view can be written as {', '.join(_VIEW_SUFFIXES)}")
     refuse_if(given.seed < 0, f"--seed must be at least 0, not {given.seed}")
@@ -160,7 +157,6 @@ def view(given: Namespace, results: Results) -> None:
 
 
 def report(given: Namespace, results: Results) -> None:
-    """Write the page."""
     lacking = given.holdout and not given.scans
     refuse_if(lacking, f"--holdout {given.holdout} needs the scans: name them after the map")
 
@@ -192,7 +188,6 @@ def add_report(results: Results, path: Path, subject: Subject) -> None:
 
 
 def compare(given: Namespace, results: Results) -> None:
-    """Compare two maps, write coloured surfaces, report changes."""
     out, report = given.out, given.report
     if out is not None:
         checked_suffix(out, MESH_SUFFIXES, "meshes")
@@ -235,7 +230,6 @@ def compare(given: Namespace, results: Results) -> None:
 
 
 def grid(given: Namespace, results: Results) -> None:
-    """Build the grid, write its files, and draw a picture if asked for."""
     out, heights = given.out, given.heights
     flat = [path for path in out if path.suffix.lower() == ".yaml"]
     for path in out:

@@ -176,11 +176,9 @@ class Viewer(Page):
     def _surface_state(self) -> dict[str, Any]:
         """Fields of :class:`State` set by the controls of the surface. At its maximum, the slider sets no limit."""
         uncertainty_m = self._uncertainty.value
-        return {
-            "max_uncertainty_m": math.inf if uncertainty_m >= self._uncertainty.max else float(uncertainty_m),
-            "min_confidence": float(self._confidence.value),
-            "quantity": str(self._quantity.value),
-        }
+        max_uncertainty_m = math.inf if uncertainty_m >= self._uncertainty.max else float(uncertainty_m)
+        limits = (max_uncertainty_m, float(self._confidence.value))
+        return {"limits": limits, "quantity": str(self._quantity.value)}
 
     def _frame_all(self, client: Any) -> CameraPose:
         camera = client.camera

@@ -38,17 +38,11 @@ class State:
     """State of the controls."""
 
     sensor: Position  # world, m
-    max_uncertainty_m: float
-    min_confidence: float
+    limits: tuple[float, float]  # uncertainty, m, and confidence: arguments of :meth:`ShownSurface.kept`
     quantity: str = ""
     scan: int | None = None
     coarse: bool = False  # whether the sensor is moving: show the cloud first
     settle_s: float = 0.0  # draw the mesh if nothing changes for this long
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """The arguments of :meth:`ShownSurface.kept`."""
-        return self.max_uncertainty_m, self.min_confidence
 
 
 class Painter:
@@ -139,7 +133,6 @@ class Canvas:
             )
 
     def show_scan(self, state: State) -> None:
-        """Show the returns of the scan."""
         if self._scans is not None and state.scan is not None:
             self._scans.show(state.scan)
 
@@ -225,7 +218,6 @@ class ScanClouds:
         return x, y, z
 
     def show(self, index: int) -> None:
-        """Show the returns of a scan."""
         if index == self._shown:
             return
         self._shown = index
