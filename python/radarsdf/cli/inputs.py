@@ -126,10 +126,9 @@ def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
     return scans.select(train), scans.select(test)
 
 
-def inputs_of(given: Namespace) -> list[Path]:
+def inputs_of(given: Namespace) -> list[Path | None]:
     """The input files and folders, which no output may overwrite."""
-    paths = (vars(given).get("map"), given.scans, given.poses, given.extrinsic, given.imu_rotation)
-    return [path for path in paths if path is not None]
+    return [vars(given).get("map"), given.scans, given.poses, given.extrinsic, given.imu_rotation]
 
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:

@@ -95,12 +95,10 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
     left_out = len(every_ray) - len(inside)
     line = f"{left_out} of {len(every_ray)} held-out returns are skipped: outliers, or in no tile"
     results.add(line if left_out else None, not_compared=left_out)
-    (x, sensors), measured = inside.in_world(), inside.intensities
-    assert measured is not None
-    assert known.intensities is not None
+    (x, sensors), measured = inside.in_world(), np.asarray(inside.intensities)
     errors = intensity_metrics(found, measured)
     results.add("held-out " + format_metrics(errors), held_out=errors)
-    knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
+    knn = KNNIntensity.chosen(*known.in_world(), np.asarray(known.intensities), known.scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)
     line = f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours"
     results.add(line, knn=metrics | {"neighbours": knn.k, "candidates": knn.candidates})

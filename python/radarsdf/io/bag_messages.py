@@ -63,11 +63,9 @@ _NOT_MEASURED = -1.0  # a variance of sensor_msgs/Imu that marks a missing measu
 
 
 class Topic(NamedTuple):
-    """A topic, with its messages in all bags."""
-
     name: str
     message_type: str
-    num_messages: int
+    num_messages: int  # in all bags
 
 
 class Pose(NamedTuple):

@@ -224,8 +224,7 @@ def intensity_values(subject: Subject) -> dict[str, Any] | None:
     usable = every_ray.select(every_ray.with_intensity)
     rows = np.linspace(0, len(usable) - 1, min(len(usable), _MAX_RETURNS)).astype(np.int64)
     rays, found = predicted(subject.radar_map, usable.select(rows))
-    assert rays.intensities is not None
-    measured = rays.intensities.astype(np.float64)
+    measured = np.asarray(rays.intensities, np.float64)
     metrics = intensity_metrics(found, measured)
     deviation = np.abs(measured - np.median(measured))
     return {

@@ -17,17 +17,15 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import numpy as np
+from typing_extensions import Self
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import whole_number
 from radarsdf.extras import require
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 LOCALHOST = "127.0.0.1"
 _FIRST_PORT, _PORTS_TRIED = 8080, 100
@@ -179,7 +177,7 @@ class Page:
     def stop(self) -> None:
         stop_server(self._server)
 
-    def __enter__(self) -> "Self":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
