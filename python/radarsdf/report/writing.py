@@ -296,11 +296,13 @@ def _colored(
     return scale(values), {"label": label, "scale": scale}
 
 
-def _pictures(mesh: Any, colors: Bytes, origin: Floats, *sensors: Floats | None) -> dict[str, Any]:
+def _pictures(
+    mesh: Any, colors: Bytes, origin: Floats, sensors: Floats | None = None, explained: Floats | None = None
+) -> dict[str, Any]:
     """Show a mesh with vertex colours (V, 3) in a :func:`scene` around `origin`, and from each of its sides, by name."""
     local = np.asarray(mesh.vertices, np.float64) - origin
     views = {name: _picture(mesh, colors, *side) for name, side in _SIDES.items()}
-    return {"scene": scene(local, mesh.faces, colors, *sensors), "views": views}
+    return {"scene": scene(local, mesh.faces, colors, sensors, explained), "views": views}
 
 
 def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
@@ -315,11 +317,7 @@ def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float =
 
 
 def scene(
-    vertices: Floats,
-    faces: Array,
-    colors: Bytes,
-    sensors: Floats | None = None,
-    explained: Floats | None = None,
+    vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None, explained: Floats | None
 ) -> str:
     """Export a self-contained HTML page that shows a mesh in 3D, made by viser.
 

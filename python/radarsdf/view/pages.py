@@ -12,30 +12,10 @@ from radarsdf.checks import check
 from radarsdf.grids.grid import Grid
 from radarsdf.map.map import Map
 from radarsdf.scans import Scan, Scans
-from radarsdf.view.scene import (
-    HELD_S,
-    POINTS,
-    SCAN_COLORS,
-    SLID_S,
-    Canvas,
-    Painter,
-    ScanClouds,
-    State,
-    add_path,
-)
+from radarsdf.view.scene import POINTS, SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_path, add_surface
 from radarsdf.view.serving import FOV_RAD, CameraPose, Page, framing_pose, set_initial_camera
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
-from radarsdf.view.surface import (
-    SHARES,
-    ShownSurface,
-    as_html,
-    first_hit,
-    glb,
-    lightness_of,
-    quantities_of,
-    shaded,
-    thinned,
-)
+from radarsdf.view.surface import SHARES, ShownSurface, as_html, first_hit, quantities_of, thinned
 
 if TYPE_CHECKING:
     import trimesh
@@ -44,6 +24,8 @@ _GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's
 _MARK_SHARE = 0.012  # radius of a click's mark, as a share of its distance: of constant size on the screen
 _MARK_COLOR = (0, 190, 255)  # not on the colour scale
 _MAX_VERTICES = 500_000
+_HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
+_SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
 _MAX_LISTED = 12  # changes
 _NOTES = {"unseen": ": not observed by the other map", "gone": ": of the earlier map"}
 _NAMED_COLORS = [(NAMES[kind], color) for kind, color in sorted(COLORS.items(), reverse=True)]
@@ -132,7 +114,7 @@ class Viewer(Page):
             self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
 
         async def on_limit(_: Any) -> None:
-            self._painter.change(**self._surface_state(), coarse=False, settle_s=SLID_S)
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=_SLID_S)
 
         async def on_quantity(_: Any) -> None:
             self._legend.content = as_html("legend", self.quantities[self._quantity.value])
@@ -151,18 +133,20 @@ class Viewer(Page):
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
         colors: dict[str, Any] = {**SCAN_COLORS, "measured": scale or SCAN_COLORS["measured"]}
-        colors |= {} if explained is None else {"trajectory": SHARES}
+        path_color: Any = colors["trajectory"]
+        if explained is not None:
+            colors["trajectory"], path_color = SHARES, SHARES(explained)[:-1, None].repeat(2, axis=1)
         with tab, gui.add_folder("scans"):
             gui.add_html(as_html("key", colors))
             slider = gui.add_slider("scan", 0, max(len(scans) - 1, 1), 1, 0, disabled=len(scans) == 1)
-            clouds = ScanClouds(self._server, self._map, scans, scale, gui.add_markdown(""), explained)
+            clouds = ScanClouds(self._server, self._map, scans, scale, gui.add_markdown(""), path_color)
             boxes = {name: gui.add_checkbox(name, True) for name in colors}
 
         async def on_scan(_: Any) -> None:
             sensor = clouds.sensor(int(slider.value))
             if self._gizmo is not None:
                 self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
-            self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=SLID_S)
+            self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=_SLID_S)
 
         async def on_box(_: Any) -> None:
             for name, box in boxes.items():
@@ -217,7 +201,7 @@ class Viewer(Page):
         async def on_update(event: Any) -> None:
             sensor = self._map.origin + np.asarray(event.target.position, np.float64)
             moving = event.phase != "end"
-            self._painter.change(sensor=tuple(sensor.tolist()), coarse=moving, settle_s=HELD_S * moving)
+            self._painter.change(sensor=tuple(sensor.tolist()), coarse=moving, settle_s=_HELD_S * moving)
 
         self._gizmo.on_update(on_update)
 
@@ -276,13 +260,12 @@ class GrowingView(Page, Sink):
         self._add_points("/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
 
     def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:  # noqa: ARG002
-        local, server, shade = self._local(mesh.vertices), self._server, lightness_of(mesh.vertex_normals)
+        local, server = self._local(mesh.vertices), self._server
         if not self._framed:
             self._framed = True
             set_initial_camera(server, framing_pose(local))
-        data = glb(local, mesh.faces, shaded(uncertainty_colors(mesh), shade))
         with server.atomic():
-            server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
+            add_surface(server, mesh, local, uncertainty_colors(mesh))
             if len(path) > 1:
                 add_path(server, "/path", self._local(path), PATH_COLOR)
 
@@ -304,12 +287,10 @@ class ChangesView(Page):
         check(len(mesh.faces), "the map has no surface here")
         vertices = np.asarray(mesh.vertices, np.float64)
         local = vertices - vertices.mean(axis=0)  # the page computes in float32
-        colors = shaded(colors_of(mesh.vertex_attributes["kind"]), lightness_of(mesh.vertex_normals))
         self._start()
         server = self._server
         set_initial_camera(server, framing_pose(local))
-        data = glb(local, mesh.faces, colors)
-        server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
+        add_surface(server, mesh, local, colors_of(mesh.vertex_attributes["kind"]))
         listed = regions[:_MAX_LISTED]
         rows = {centre_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in listed}
         server.gui.add_html(as_html("key", MEANING))

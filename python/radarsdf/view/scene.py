@@ -18,10 +18,17 @@ from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
-from radarsdf.view.surface import SHARES, Position, Quantity, Scale, ShownSurface, glb, shaded, spread_evenly
+from radarsdf.view.surface import (
+    Position,
+    Quantity,
+    Scale,
+    ShownSurface,
+    glb,
+    lightness_of,
+    shaded,
+    spread_evenly,
+)
 
-HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
-SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
 # Measured returns without intensities; predictions are not on the intensity scale, and stand out from the surface.
 SCAN_COLORS = {"measured": (0, 72, 140), "predicted": (0, 158, 115), "trajectory": (40, 44, 52)}
 
@@ -193,23 +200,13 @@ class ScanClouds:
     """The sensor's path, and the returns of one scan, measured in the colours of `scale` and predicted; `text` describes it."""
 
     def __init__(
-        self,
-        server: Any,
-        radar_map: Map,
-        scans: Scans,
-        scale: Scale | None,
-        text: Any,
-        explained: Floats | None,
+        self, server: Any, radar_map: Map, scans: Scans, scale: Scale | None, text: Any, path_color: Any
     ) -> None:
         self._server, self._map, self._scans = server, radar_map, list(scans)
         self._scale, self._text = scale, text
         self._shown: int | None = None
         path = scans.sensor_poses[:, :3, 3] - radar_map.origin
-        color = (
-            SCAN_COLORS["trajectory"] if explained is None else SHARES(explained)[:-1, None].repeat(2, axis=1)
-        )
-        line = add_path(server, "/scans/path", path, color)
-        self.nodes: dict[str, Any] = {"trajectory": line}
+        self.nodes: dict[str, Any] = {"trajectory": add_path(server, "/scans/path", path, path_color)}
         self.show(0)
 
     def sensor(self, index: int) -> Position:
@@ -246,6 +243,12 @@ class ScanClouds:
         shape, size_m = _STYLES[what]
         options = POINTS | {"point_shape": shape, "point_size": size_m}
         self.nodes[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
+
+
+def add_surface(server: Any, mesh: Any, local: Floats, colors: Bytes) -> None:
+    """Add a mesh in sRGB colours (V, 3), shaded by its normals, with its vertices at `local` (V, 3), m."""
+    data = glb(local, mesh.faces, shaded(colors, lightness_of(mesh.vertex_normals)))
+    server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
 
 
 def add_path(server: Any, name: str, path: Array, color: tuple[int, int, int] | Bytes) -> Any:
