@@ -225,11 +225,6 @@ def is_bag(path: Path) -> bool:
     return not files or any(name in listed for name in files)
 
 
-def bags_in(folder: Path) -> list[Path]:
-    """Bags in a folder, sorted by name."""
-    return sorted(path for path in folder.iterdir() if is_bag(path) and not path.name.startswith("."))
-
-
 def topics_of(paths: list[Path]) -> dict[str, Topic]:
     """Topics of bags, by name."""
     topics: dict[str, Topic] = {}
