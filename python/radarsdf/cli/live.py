@@ -125,19 +125,18 @@ def live(given: Namespace, results: Results) -> None:
         changed = begin and (given.config or given.set or given.paper)
         refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
         scans: Scans | Subscription
+        folder = None
         if request is None:
             scans, unposed = scans_or_unposed(given, find=given.find)
             timed = len(scans.points) and (scans.times_s is not None or not unposed)
             check(timed, f"{given.scans}: scans without poses need times, one per scan")
             if trajectory is not None:
                 check_pose_times(trajectory, scans.times_s)
-        folder = None
-        if request is not None:
+        else:
             # Of the scans of hours of driving, memory holds only the last ones. /tmp may be memory.
             parent = None if out is None else out.absolute().parent
-            folder = servers.enter_context(
-                TemporaryDirectory(prefix="radarsdf-", dir=parent, ignore_cleanup_errors=True)
-            )
+            temporary = TemporaryDirectory(prefix="radarsdf-", dir=parent, ignore_cleanup_errors=True)
+            folder = servers.enter_context(temporary)
         with deferred_interrupts() as stopped:
             if request is not None:
                 node = servers.enter_context(contextlib.closing(Node(given.ros2_domain, given.host)))

@@ -42,11 +42,8 @@ _STEPS_PER_M = 1024  # vertices are rounded to multiples of 1 m / 1024: fewer di
 _SENSOR_COLOR = (0, 114, 178)
 # The icon holds the only address of another machine in viser's page, though only as the name of an XML namespace.
 _ICON = re.compile(r'<link\s+rel="icon".*?/>', re.DOTALL)
-_FIRST_SIDE = (25.0, 36.0)
-_SIDES = {
-    "One long side": _FIRST_SIDE,
-    "Steeply from above": (0.0, 70.0),  # not straight down: walls would be lines
-}  # azimuth and elevation of each view, degrees
+# Azimuth and elevation of each view, degrees, if they are not the usual ones. Straight down, walls would be lines.
+_SIDES: dict[str, tuple[float, ...]] = {"One long side": (), "Steeply from above": (0.0, 70.0)}
 _FIRST, _SECOND = "#0072b2", "#d55e00"  # distinguishable by colour-blind readers
 _SAMPLES = 1_000_000
 _MATCH_M = 0.4  # a vertex farther from the truth is an outlier rather than an inaccurate surface
@@ -305,11 +302,11 @@ def _pictures(
     return {"scene": scene(local, mesh.faces, colors, sensors, explained), "views": views}
 
 
-def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
+def _picture(mesh: Any, colors: Bytes, *side: float) -> bytes:
     """Render a mesh with vertex colours (V, 3), seen from :func:`eye_around`, as JPEG."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
-    eye = eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg)
+    eye = eye_around(np.asarray(mesh.vertices, np.float64), *side)
     pixels = render(mesh, colors, width=_WIDTH, height=_HEIGHT, viewpoint=eye)
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format="jpeg", quality=82, optimize=True)
@@ -326,7 +323,7 @@ def scene(
     other machines in its program are never used; the report's content security policy forbids fetching them.
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
-    to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
+    to_eye = eye_around(vertices) - middle_of(vertices)[0]
     pose = framing_pose(everything, to_eye, _SCENE_ASPECT)
     host = "127.0.0.1"
     server: Any = start_server(host, free_port(host, 0))
