@@ -32,7 +32,7 @@ from radarsdf.scans import Scans
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import MEANING, centre_of
-from radarsdf.view.serving import framing_pose, free_port, set_initial_camera, start_server, stop_server
+from radarsdf.view.serving import aim, framing_pose, free_port, start_server, stop_server
 from radarsdf.view.surface import SHARES, Scale, glb, templates_of, thinned
 
 MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
@@ -335,7 +335,7 @@ def scene(
             style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
             sensor_colors = _SENSOR_COLOR if explained is None else SHARES(explained)
             server.scene.add_point_cloud("/sensor", sensors.astype(np.float32), sensor_colors, **style)
-        set_initial_camera(server, pose)
+        aim(server.initial_camera, pose)
         document: str = server.get_scene_serializer().as_html()
     finally:
         stop_server(server)

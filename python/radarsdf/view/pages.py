@@ -13,7 +13,7 @@ from radarsdf.grids.grid import Grid
 from radarsdf.map.map import Map
 from radarsdf.scans import Scan, Scans
 from radarsdf.view.scene import POINTS, SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_path, add_surface
-from radarsdf.view.serving import FOV_RAD, CameraPose, Page, framing_pose, set_initial_camera
+from radarsdf.view.serving import CameraPose, Page, aim, framing_pose
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
 from radarsdf.view.surface import SHARES, ShownSurface, as_html, first_hit, quantities_of, thinned
 
@@ -76,7 +76,7 @@ class Viewer(Page):
         origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.sensor_poses[:, :3, 3] - origin
         self._extent = np.concatenate([surface.vertices - origin, path])
-        set_initial_camera(server, framing_pose(self._extent))
+        aim(server.initial_camera, framing_pose(self._extent))
         x, y, z = (origin if scans is None else scans.sensor_poses[0, :3, 3]).tolist()
         self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
         self._clicked: Floats | None = None
@@ -169,8 +169,7 @@ class Viewer(Page):
         pose = framing_pose(self._extent, aspect=_aspect(camera))
         with client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
-            camera.fov = FOV_RAD
-            camera.position, camera.look_at = pose
+            aim(camera, pose)
         return pose
 
     async def _on_connect(self, client: Any) -> None:
@@ -263,7 +262,7 @@ class GrowingView(Page, Sink):
         local, server = self._local(mesh.vertices), self._server
         if not self._framed:
             self._framed = True
-            set_initial_camera(server, framing_pose(local))
+            aim(server.initial_camera, framing_pose(local))
         with server.atomic():
             add_surface(server, mesh, local, uncertainty_colors(mesh))
             if len(path) > 1:
@@ -289,7 +288,7 @@ class ChangesView(Page):
         local = vertices - vertices.mean(axis=0)  # the page computes in float32
         self._start()
         server = self._server
-        set_initial_camera(server, framing_pose(local))
+        aim(server.initial_camera, framing_pose(local))
         add_surface(server, mesh, local, colors_of(mesh.vertex_attributes["kind"]))
         listed = regions[:_MAX_LISTED]
         rows = {centre_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in listed}

@@ -131,8 +131,7 @@ def stop_server(server: Any) -> None:
         server.stop()
 
 
-def set_initial_camera(server: Any, pose: "CameraPose") -> None:
-    camera = server.initial_camera
+def aim(camera: Any, pose: "CameraPose") -> None:
     camera.fov = FOV_RAD
     camera.position, camera.look_at = map(tuple, pose)
 
