@@ -23,14 +23,14 @@ from radarsdf.scans import Columns, Notes
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ARS548_DEFINITION = (
     "float32 azimuth; float32 azimuth_std; {} invalid; float32 elevation; float32 elevation_std; float32 range; "
     "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
     "uint8 multi_target; uint16 object; uint8 ambiguity"
 )
 _DEFINITIONS = {
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "tf/msg/tfMessage": "geometry_msgs/TransformStamped[] transforms",
+    **dict.fromkeys(TRANSFORM_TYPES, "geometry_msgs/TransformStamped[] transforms"),
     "radar_msgs/msg/RadarReturn": (
         "float32 range; float32 azimuth; float32 elevation; float32 doppler_velocity; float32 amplitude"
     ),
@@ -202,7 +202,6 @@ _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _ars548_packets,
 }
-TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _GEOMETRY = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
 _POSES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/{name}" for name in _GEOMETRY))
 CLOUD_TYPES, POSE_TYPES = tuple(_CLOUDS), (*_POSES, PATH)

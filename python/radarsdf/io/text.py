@@ -91,12 +91,9 @@ def _values(rows: list[str]) -> Floats:
         return np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
     words = [row.rstrip(",; \t").split(separator) for row in rows]
     width = Counter(map(len, words)).most_common(1)[0][0]
-    table = np.full((len(words), width), np.nan)
-    known = np.zeros(table.shape, bool)
-    for row, parts in enumerate(words):
-        if len(parts) == width:
-            known[row] = [_is_number(part) for part in parts]
-            table[row, known[row]] = [float(part) for part in parts if _is_number(part)]
+    cells = [parts if len(parts) == width else [""] * width for parts in words]
+    known = np.array([[_is_number(cell) for cell in parts] for parts in cells])
+    table = np.array([[float(cell) if _is_number(cell) else np.nan for cell in parts] for parts in cells])
     of_words = ~known.any(axis=0)  # a column of labels is no damage
     damaged = ~known[:, ~of_words].all(axis=1)
     most = of_words.all() or 2 * damaged.sum() > len(words)

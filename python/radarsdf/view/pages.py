@@ -86,8 +86,7 @@ class Viewer(Page):
         self._gizmo: Any = None
         if radar_map.has_intensity:
             self._add_sensor(np.array([x, y, z]) - origin)
-        state = State((x, y, z), **self._surface_state(), scan=None if scans is None else 0)
-        self._painter = Painter(self._canvas, state)
+        self._painter = Painter(self._canvas, State((x, y, z), **self._surface_state()))
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
 

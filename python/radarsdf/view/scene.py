@@ -47,7 +47,7 @@ class State:
     sensor: Position  # world, m
     limits: tuple[float, float]  # uncertainty, m, and confidence: arguments of :meth:`ShownSurface.kept`
     quantity: str = ""
-    scan: int | None = None
+    scan: int = 0
     coarse: bool = False  # whether the sensor is moving: show the cloud first
     settle_s: float = 0.0  # draw the mesh if nothing changes for this long
 
@@ -140,7 +140,7 @@ class Canvas:
             )
 
     def show_scan(self, state: State) -> None:
-        if self._scans is not None and state.scan is not None:
+        if self._scans is not None:
             self._scans.show(state.scan)
 
     def show_cloud(self, state: State) -> None:
