@@ -140,7 +140,6 @@ def _poses(words: list[str]) -> NDArray[np.float64]:
 
 
 def view(given: Namespace, results: Results) -> None:
-    """Serve the page until Ctrl-C, after printing its address."""
     check_address(given)
     radar_map = load_map(given.map)
     scans, explained = _scans(given, radar_map, results)

@@ -123,14 +123,13 @@ def read_mesh(path: AnyPath) -> "trimesh.Trimesh":
 def read_ground_truth(path: AnyPath) -> Floats:
     """Read points (M, 3), world, m, of a cloud or ``.npz`` file, or sample a mesh: the same file gives the same points."""
     file = Path(path)
-    suffix = file.suffix.lower()
     if holds_mesh(file):
         mesh = read_mesh(file)
         check(mesh.area > 0, f"{path} has no surface")
         # By area, in the order of the triangles, so that each large triangle gets points.
         samples: Any = mesh.sample(_SAMPLES, return_index=True, seed=0)
         return np.asarray(samples[0], np.float64)
-    if suffix == ".npz":
+    if file.suffix.lower() == ".npz":
         names = (*TRUTH_ARRAYS, "points")
         arrays = arrays_of(file, names)
         check(arrays, f"{path} has no ground truth: it lacks an array {' or '.join(names)}")

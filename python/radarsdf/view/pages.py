@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from radarsdf.view.scene import POINTS, SCAN_COLORS, Canvas, Painter, ScanClouds
 from radarsdf.view.serving import CameraPose, Page, aim, framing_pose
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
 from radarsdf.view.surface import SHARES, ShownSurface, as_html, first_hit, quantities_of, thinned
-
-if TYPE_CHECKING:
-    import trimesh
 
 _GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
 _MARK_SHARE = 0.012  # radius of a click's mark, as a share of its distance: of constant size on the screen
@@ -257,7 +254,7 @@ class GrowingView(Page, Sink):
         world = np.concatenate([scan.T_world_sensor[None, :3, 3], scan.world_points])
         self._add_points("/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
 
-    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:  # noqa: ARG002
+    def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:  # noqa: ARG002
         local, server = self._local(mesh.vertices), self._server
         if not self._framed:
             self._framed = True
