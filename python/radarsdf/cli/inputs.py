@@ -11,10 +11,10 @@ from radarsdf.checks import check_pose
 from radarsdf.cli.options import GROUPS, LIMITS, refuse_if
 from radarsdf.cli.results import warn
 from radarsdf.evaluation import holdout
+from radarsdf.io.columns import read_numbers
 from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
 from radarsdf.io.recordings import Request
-from radarsdf.io.text import read_numbers
 from radarsdf.map.map import Map
 from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import lacking, load

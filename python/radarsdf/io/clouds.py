@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from radarsdf.arrays import Array, Floats, Floats32
 from radarsdf.checks import AnyPath, check, path_of
 from radarsdf.extras import require
-from radarsdf.io.fields import SIGMA, Fields, columns_of, names_of
+from radarsdf.io.columns import SIGMA, Fields, as_numbers, columns_of, names_of, read_table
 from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, reading, whole_file
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import as_numbers, read_table
 from radarsdf.scans import Columns, Notes, Scans
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")

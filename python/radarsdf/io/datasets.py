@@ -15,10 +15,10 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check, check_pose
+from radarsdf.io.columns import read_numbers, read_text
 from radarsdf.io.files import reading
 from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
 from radarsdf.io.recordings import Request, first_file, lidar_map, natural, read_files
-from radarsdf.io.text import read_numbers, read_text
 from radarsdf.scans import Scans
 
 

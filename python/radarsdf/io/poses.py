@@ -24,9 +24,9 @@ from radarsdf.checks import (
     pose_matrices,
     real_array,
 )
+from radarsdf.io.columns import in_seconds, read_numbers, read_table, read_text, scaled, without_unit
 from radarsdf.io.files import check_regular_file, checked_suffix, reading, write_whole
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import in_seconds, read_numbers, read_table, read_text, scaled, without_unit
 from radarsdf.scans import Columns, Notes
 
 MAX_GAP_S = 0.5  # longest gap to interpolate across, by default

@@ -15,7 +15,7 @@ from radarsdf.io import poses as pose_files
 from radarsdf.io.bag_messages import BAG_SUFFIXES, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import READERS, read_points
-from radarsdf.io.fields import columns_of
+from radarsdf.io.columns import columns_of
 from radarsdf.io.npz import read_scans
 from radarsdf.rig import checked_rotation
 from radarsdf.scans import Notes, Scans

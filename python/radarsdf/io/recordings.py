@@ -19,7 +19,7 @@ import numpy as np
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, UNNAMED, check_kitti, read_columns, read_points
-from radarsdf.io.fields import Fields
+from radarsdf.io.columns import Fields, in_seconds, read_numbers, read_table, scaled, unit_since_1970
 from radarsdf.io.files import reading
 from radarsdf.io.poses import (
     FIND_POSES,
@@ -34,7 +34,6 @@ from radarsdf.io.poses import (
     poses_of,
     read_transform,
 )
-from radarsdf.io.text import in_seconds, read_numbers, read_table, scaled, unit_since_1970
 from radarsdf.rig import Label
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
