@@ -12,7 +12,7 @@ from radarsdf.checks import check
 from radarsdf.grids.grid import Grid
 from radarsdf.map.map import Map
 from radarsdf.scans import Scan, Scans
-from radarsdf.view.scene import POINTS, SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_path, add_surface
+from radarsdf.view.scene import SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_cloud, add_mesh, add_path
 from radarsdf.view.serving import CameraPose, Page, aim, framing_pose
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
 from radarsdf.view.surface import SHARES, ShownSurface, as_html, first_hit, quantities_of, thinned
@@ -252,7 +252,7 @@ class GrowingView(Page, Sink):
 
     def show_scan(self, scan: Scan, time_s: float) -> None:  # noqa: ARG002
         world = np.concatenate([scan.T_world_sensor[None, :3, 3], scan.world_points])
-        self._add_points("/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
+        add_cloud(self._server, "/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
 
     def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:  # noqa: ARG002
         local, server = self._local(mesh.vertices), self._server
@@ -260,17 +260,13 @@ class GrowingView(Page, Sink):
             self._framed = True
             aim(server.initial_camera, framing_pose(local))
         with server.atomic():
-            add_surface(server, mesh, local, uncertainty_colors(mesh))
+            add_mesh(server, mesh, local, uncertainty_colors(mesh))
             if len(path) > 1:
                 add_path(server, "/path", self._local(path), PATH_COLOR)
 
     def show_grid(self, grid: Grid, time_s: float) -> None:  # noqa: ARG002
         free = self._local(grid.centres(grid.free))
-        self._add_points("/free space", free, FREE_COLOR, 0.2 * grid.voxel_size)
-
-    def _add_points(self, name: str, local: Floats, color: Any, size_m: float) -> None:
-        points, colors = local.astype(np.float32), np.full(local.shape, color, np.uint8)
-        self._server.scene.add_point_cloud(name, points, colors, point_size=size_m, **POINTS)
+        add_cloud(self._server, "/free space", free, FREE_COLOR, 0.2 * grid.voxel_size)
 
 
 class ChangesView(Page):
@@ -285,7 +281,7 @@ class ChangesView(Page):
         self._start()
         server = self._server
         aim(server.initial_camera, framing_pose(local))
-        add_surface(server, mesh, local, colors_of(mesh.vertex_attributes["kind"]))
+        add_mesh(server, mesh, local, colors_of(mesh.vertex_attributes["kind"]))
         listed = regions[:_MAX_LISTED]
         rows = {centre_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in listed}
         server.gui.add_html(as_html("key", MEANING))

@@ -37,7 +37,7 @@ _DRAG_POINTS = 30_000
 _POINT_SIZE = 1.4  # size in vertex spacings, which leaves no holes between points
 _STYLES = {"measured": ("circle", 0.25), "predicted": ("diamond", 0.2)}  # size, m
 # In float16, points would lie on a grid of 3 cm at 60 m.
-POINTS = {"point_shading": "flat", "precision": "float32"}
+_POINTS = {"point_shading": "flat", "precision": "float32"}
 
 
 @dataclass(frozen=True)
@@ -129,15 +129,9 @@ class Canvas:
         server.scene.add_frame("/surface", show_axes=False)  # the parent of mesh and cloud
         self._cloud: Any = None
         if any(quantity.of_sensor for quantity in quantities.values()):
-            self._cloud = server.scene.add_point_cloud(
-                "/surface/cloud",
-                self._local[self._spread],
-                np.full((len(self._spread), 3), NEUTRAL, np.uint8),
-                point_shape="circle",
-                point_size=_POINT_SIZE * spacing_m,
-                visible=False,
-                **POINTS,
-            )
+            points, style = self._local[self._spread], {"point_shape": "circle", "visible": False}
+            size_m = _POINT_SIZE * spacing_m
+            self._cloud = add_cloud(server, "/surface/cloud", points, NEUTRAL, size_m, **style)
 
     def show_scan(self, state: State) -> None:
         if self._scans is not None:
@@ -241,11 +235,17 @@ class ScanClouds:
             self.nodes[what].points, self.nodes[what].colors = local, colors
             return
         shape, size_m = _STYLES[what]
-        options = POINTS | {"point_shape": shape, "point_size": size_m}
-        self.nodes[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
+        name = f"/scans/{what}"
+        self.nodes[what] = add_cloud(self._server, name, local, colors, size_m, point_shape=shape)
 
 
-def add_surface(server: Any, mesh: Any, local: Floats, colors: Bytes) -> None:
+def add_cloud(server: Any, name: str, points: Array, colors: Any, size_m: float, **style: Any) -> Any:
+    """Add a cloud of points (N, 3), m, of one sRGB colour, or of colours (N, 3)."""
+    values = points.astype(np.float32), np.full(points.shape, colors, np.uint8)
+    return server.scene.add_point_cloud(name, *values, point_size=size_m, **_POINTS, **style)
+
+
+def add_mesh(server: Any, mesh: Any, local: Floats, colors: Bytes) -> None:
     """Add a mesh in sRGB colours (V, 3), shaded by its normals, with its vertices at `local` (V, 3), m."""
     data = glb(local, mesh.faces, shaded(colors, lightness_of(mesh.vertex_normals)))
     server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
