@@ -326,10 +326,8 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # damaged bags raise exceptions of many kinds, including OSError
         raise _damaged(path, error) from error
-    try:
+    with closing(reader):
         yield reader
-    finally:
-        reader.close()
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:

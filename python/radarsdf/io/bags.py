@@ -42,7 +42,11 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     request.refuse(f"{request.notes.about}: messages have names of columns", "columns")
     topics = bag_messages.topics_of(paths)
     scan_topics = _scan_topics(topics, request)
-    peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
+    peeked: dict[str, list[Message]] = {}
+    for name in (topic.name for topic in scan_topics):
+        with closing(read_messages(paths, {name}, request.notes)) as messages:
+            peeked[name] = list(itertools.islice(messages, _PEEKED_SCANS))
+        check(peeked[name], f"{paths[0]}: {name} has no messages that can be read{request.notes.ending()}")
     counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
     clocks = {}
@@ -155,13 +159,6 @@ def _listed(topics: Iterable[Topic]) -> str:
 
 def _is_radar(topic: Topic) -> bool:
     return bool(_RADAR.search(f"{topic.name} {topic.message_type}"))
-
-
-def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
-    with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
-        peeked = list(itertools.islice(messages, _PEEKED_SCANS))
-    check(peeked, f"{paths[0]}: {topic.name} has no messages that can be read{request.notes.ending()}")
-    return peeked
 
 
 def _raw_scans(paths: list[Path], topic: Topic, clock: Clock, request: Request) -> Iterator[RawScan]:
