@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.fields import Fields
+from radarsdf.io.columns import Fields
 from radarsdf.scans import Notes
 
 # Fields of doppler and intensity, and all fields, of each sensor.

@@ -5,9 +5,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds import read_columns
+from radarsdf.io.columns import are_degrees, in_seconds, read_numbers
 from radarsdf.io.poses import read_poses, trajectory_of
 from radarsdf.io.recordings import times_in
-from radarsdf.io.text import are_degrees, in_seconds, read_numbers
 from radarsdf.scans import Notes
 
 ROWS = np.array([[1.5, -2, 3, 40.25], [4, 5.125, 6, 70], [7, 8, 9e-2, 10]])

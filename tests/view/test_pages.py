@@ -18,7 +18,7 @@ from radarsdf.changes.changes import (
     Changes,
 )
 from radarsdf.scans import Scan
-from radarsdf.view import pages, serving
+from radarsdf.view import pages, scene, serving
 
 FAR = np.array([4e5, 5e6, 100.0])  # UTM: float32 would round it to half a metre
 
@@ -72,7 +72,7 @@ def triangles(kinds, offset):
 
 def test_changes_have_their_colours_and_a_legend(server, monkeypatch):
     meshes = []
-    monkeypatch.setattr(pages, "glb", lambda *mesh: meshes.append(mesh) or b"glb")
+    monkeypatch.setattr(scene, "glb", lambda *mesh: meshes.append(mesh) or b"glb")
     after = triangles([SAME, APPEARED, REFLECTANCE_CHANGED], [0, 0, 0])
     changes = Changes(triangles([GONE], [0, 3.0, 0]), after, np.eye(4), {"alignment": "As <given>."})
     with pages.ChangesView(changes, changes.regions(), 0.2, port=0):

@@ -11,7 +11,7 @@ from radarsdf.view import scene as module
 from radarsdf.view.scene import Canvas, Painter, State
 from radarsdf.view.surface import ShownSurface, quantities_of
 
-ALL = State((0.0, 0.0, 1.5), max_uncertainty_m=9.0, min_confidence=0.0, quantity="intensity")
+ALL = State((0.0, 0.0, 1.5), limits=(9.0, 0.0), quantity="intensity")
 MOVING = replace(ALL, coarse=True, sensor=(3.0, 0.0, 1.5))
 
 
@@ -58,7 +58,7 @@ def never():
 def test_something_is_visible_while_a_mesh_is_transferred(page):
     nodes, canvas, waits, shown = page
     canvas.show_mesh(ALL, never)
-    less = replace(ALL, max_uncertainty_m=8.0)
+    less = replace(ALL, limits=(8.0, 0.0))
     canvas.show_mesh(less, never)  # the old mesh stays until the new one is drawn
     assert waits.pop() == ["mesh 1", "mesh 2"]
     assert nodes.seen() == ["mesh 2"]
@@ -68,7 +68,7 @@ def test_something_is_visible_while_a_mesh_is_transferred(page):
     assert waits.pop() == ["cloud", "mesh 3"]
     assert nodes.seen() == ["mesh 3"]
     assert shown == [ALL, less, MOVING]
-    canvas.show_mesh(replace(MOVING, max_uncertainty_m=0.0), never)
+    canvas.show_mesh(replace(MOVING, limits=(0.0, 0.0)), never)
     assert nodes.seen() == []
     assert len(canvas.faces) == 0
 
@@ -88,7 +88,7 @@ def test_a_superseded_mesh_does_not_count_as_drawn(page):
 def test_the_cloud_hides_what_the_mesh_hides(page, sharp_map):
     _, canvas, _, _ = page
     limit = float(np.median(canvas._surface.uncertainty_m))
-    canvas.show_cloud(replace(MOVING, max_uncertainty_m=limit))
+    canvas.show_cloud(replace(MOVING, limits=(limit, 0.0)))
     seen = canvas._cloud.points + sharp_map.origin
     assert 0 < len(seen) == len(canvas._cloud.colors) < len(canvas._spread)
     assert (sharp_map.uncertainty(seen) <= limit * 1.01).all()

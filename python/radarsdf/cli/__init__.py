@@ -1,7 +1,7 @@
 """The command line: ``radarsdf COMMAND``.
 
-`options` lists the commands and their options, and `results` prints what they find; the other modules are the commands. They
-import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
+`options` describes the commands and their options, and `results` prints what they find; each command is a function of the other
+modules. They import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
 """
 
 import io
@@ -10,19 +10,12 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from radarsdf.cli.options import COMMANDS, TILE_STEPS, Parser, UsageError, overview, refuse_if, steps
+from radarsdf.cli.options import ENTRIES, TILE_STEPS, Parser, UsageError, overview, refuse_if, steps
 from radarsdf.cli.results import Results, warn
 from radarsdf.interrupts import terminable
 
 # Errors with a message for the user. Every other error is a bug and keeps its traceback.
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
-# Modules of the commands that are not in one of their own name.
-_MODULES = {
-    **dict.fromkeys(("demo", "fit"), "fits"),
-    **dict.fromkeys(("config", "info"), "settings"),
-    **dict.fromkeys(("check", "poses", "calibrate", "locate", "join", "convert"), "scans"),
-    **dict.fromkeys(("mesh", "eval", "render", "view", "report", "compare", "grid"), "maps"),
-}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,7 +47,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> int:
-    commands = {name: found for of_heading in COMMANDS.values() for name, found in of_heading.items()}
     if words in ([], ["--help"], ["-h"]):
         print(overview())
         return 0
@@ -64,22 +56,19 @@ def _run(words: list[str]) -> int:
 
         print("radarsdf", radarsdf.__version__)
         return 0
-    refuse_if(command not in commands, f"unknown command {command!r:.50}; radarsdf --help lists all")
-    arguments, text = commands[command]
+    unknown = command not in ENTRIES or " " in command
+    refuse_if(unknown, f"unknown command {command!r:.50}; radarsdf --help lists all")
     if command == "tiles":
         if not words or words[0] in ("-h", "--help"):
             print(steps())
             return 0
-        step = words.pop(0) if words[0] in TILE_STEPS else "run"
-        command, (arguments, text) = f"tiles {step}", TILE_STEPS[step]
-    usage = " ".join(filter(None, ("radarsdf", command, arguments, "[OPTIONS]...")))
-    given = Parser(command, usage, text).parse_args(words)
+        command = f"tiles {words.pop(0) if words[0] in TILE_STEPS else 'run'}"
+    given = Parser(command).parse_args(words)
 
     results = Results(**{key: vars(given).get(key, False) for key in ("quiet", "json")})
     # Each module imports only what it needs, which may take long.
-    name, _, step = command.partition(" ")
-    module = import_module(f"radarsdf.cli.{_MODULES.get(name, name)}")
-    status = getattr(module, step or ("evaluate" if name == "eval" else name))(given, results)
+    module, _, function = ENTRIES[command][0].partition(".")
+    status = getattr(import_module(f"radarsdf.cli.{module}"), function)(given, results)
     results.end()
     return int(status or 0)
 

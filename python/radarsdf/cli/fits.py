@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 import radarsdf
 from radarsdf import Interrupted, RadarMap
-from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split, without_intensities
+from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, scans_or_unposed, split, without_intensities
 from radarsdf.cli.maps import add_report, evaluate, mesh
 from radarsdf.cli.maps import view as show_map
 from radarsdf.cli.options import LIMITS, Parser, refuse_if
@@ -25,7 +25,6 @@ _SHARED = ("paper", "quick", "config", "set", "voxel", *LIMITS)
 
 
 def fit(given: Namespace, results: Results) -> None:
-    """Fit a map, or estimate the cost of the fit."""
     out, report = given.out, given.report
     not_exactly_one = (out is None) != given.dry_run
     refuse_if(not_exactly_one, "-o MAP writes the map, --dry-run only estimates: give exactly one of them")
@@ -35,7 +34,7 @@ def fit(given: Namespace, results: Results) -> None:
         require_extras()
     config = load_config(given)
     check_outputs([out, given.checkpoint, report], inputs_of(given))
-    every_scan, posed = posed_scans(given, config, results, refine=given.refine)
+    every_scan, posed = posed_scans(*scans_or_unposed(given), config, results, refine=given.refine)
     config = posed.config(config)
     scans, held_out = split(every_scan, given.holdout)
     used = without_intensities(scans) if given.geometry_only else scans
@@ -88,7 +87,6 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
 
 
 def demo(given: Namespace, results: Results) -> None:
-    """Simulate scans, then fit, mesh and evaluate them by commands, which are printed."""
     frames, out, view = given.frames, given.out, given.view
     refuse_if(frames is not None and frames < 2, f"--frames must be at least 2, not {frames}")
     if view is None:  # only if somebody can see it and stop it with Ctrl-C

@@ -11,10 +11,10 @@ from radarsdf.checks import check_pose
 from radarsdf.cli.options import GROUPS, LIMITS, refuse_if
 from radarsdf.cli.results import warn
 from radarsdf.evaluation import holdout
+from radarsdf.io.columns import read_numbers
 from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
 from radarsdf.io.recordings import Request
-from radarsdf.io.text import read_numbers
 from radarsdf.map.map import Map
 from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import lacking, load
@@ -126,10 +126,9 @@ def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
     return scans.select(train), scans.select(test)
 
 
-def inputs_of(given: Namespace) -> list[Path]:
+def inputs_of(given: Namespace) -> list[Path | None]:
     """The input files and folders, which no output may overwrite."""
-    paths = (vars(given).get("map"), given.scans, given.poses, given.extrinsic, given.imu_rotation)
-    return [path for path in paths if path is not None]
+    return [vars(given).get("map"), given.scans, given.poses, given.extrinsic, given.imu_rotation]
 
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:

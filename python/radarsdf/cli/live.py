@@ -96,9 +96,8 @@ def _due(scans: Scans, rate: float, done: Replay, stopped: Callable[[], bool]) -
     count = len(scans.points)
     times_s = np.asarray(0.1 * np.arange(count) if scans.times_s is None else scans.times_s)
     due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
-    labels = None if scans.T_body_sensor is None else scans.sensors
     begin = time.perf_counter()
-    for i in range(count):
+    for i, scan in enumerate(scans):
         now = time.perf_counter() - begin
         if rate > 0 and i + 1 < count and due_s[i + 1] <= now:
             done.dropped += 1
@@ -109,18 +108,11 @@ def _due(scans: Scans, rate: float, done: Replay, stopped: Callable[[], bool]) -
             left_s -= WAIT_STEP_S
         if stopped():
             return
-        yield Scan(
-            scans.points[i],
-            scans.poses[i],
-            None if scans.intensities is None else scans.intensities[i],
-            None if scans.doppler_mps is None else scans.doppler_mps[i],
-            float(times_s[i]),
-            sensor=None if labels is None else labels[i],
-        )
+        sensor = None if scans.T_body_sensor is None else scan.sensor
+        yield replace(scan, T_world_sensor=scans.poses[i], time_s=float(times_s[i]), sensor=sensor)
 
 
 def live(given: Namespace, results: Results) -> None:
-    """Replay the scans or map those of running topics, report whether the map kept up, and write it."""
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
     request = request_of_topics(given)
     out, trajectory = given.out, given.trajectory
@@ -133,19 +125,18 @@ def live(given: Namespace, results: Results) -> None:
         changed = begin and (given.config or given.set or given.paper)
         refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
         scans: Scans | Subscription
+        folder = None
         if request is None:
             scans, unposed = scans_or_unposed(given, find=given.find)
             timed = len(scans.points) and (scans.times_s is not None or not unposed)
             check(timed, f"{given.scans}: scans without poses need times, one per scan")
             if trajectory is not None:
                 check_pose_times(trajectory, scans.times_s)
-        folder = None
-        if request is not None:
+        else:
             # Of the scans of hours of driving, memory holds only the last ones. /tmp may be memory.
             parent = None if out is None else out.absolute().parent
-            folder = servers.enter_context(
-                TemporaryDirectory(prefix="radarsdf-", dir=parent, ignore_cleanup_errors=True)
-            )
+            temporary = TemporaryDirectory(prefix="radarsdf-", dir=parent, ignore_cleanup_errors=True)
+            folder = servers.enter_context(temporary)
         with deferred_interrupts() as stopped:
             if request is not None:
                 node = servers.enter_context(contextlib.closing(Node(given.ros2_domain, given.host)))
@@ -251,12 +242,7 @@ def _add_rates(results: Results, done: Replay) -> None:
     counts = {"scans": done.integrated, "dropped": done.dropped, "lost": done.lost}
     results.add("\n".join([line, *done.notes]), **counts, notes=done.notes)
     hertz = len(done.seconds) / max(sum(done.seconds), 1e-9)
-    p50, p99, worst = np.percentile(done.seconds, [50, 99, 100])
-    results.add(
-        f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99th percentile), {1e3 * worst:.1f} ms (worst): "
-        f"{hertz:.0f} scans per second",
-        p50_s=p50,
-        p99_s=p99,
-        worst_s=worst,
-        scans_per_second=hertz,
-    )
+    values = dict(zip(("p50_s", "p99_s", "worst_s"), np.percentile(done.seconds, [50, 99, 100]), strict=True))
+    named = zip(("median", "99th percentile", "worst"), values.values(), strict=True)
+    took = ", ".join(f"{1e3 * took_s:.1f} ms ({name})" for name, took_s in named)
+    results.add(f"a scan took {took}: {hertz:.0f} scans per second", **values, scans_per_second=hertz)

@@ -45,7 +45,6 @@ _LISTED = 10  # regions, largest first
 
 
 def mesh(given: Namespace, results: Results) -> None:
-    """Extract the mesh, write it, and draw a picture if asked for."""
     out, drawing = given.out, given.picture
     checked_suffix(out, MESH_SUFFIXES, "meshes")
     check_outputs([out, drawing], [given.map])
@@ -60,7 +59,6 @@ def mesh(given: Namespace, results: Results) -> None:
 
 
 def evaluate(given: Namespace, results: Results) -> None:
-    """Print the errors of the surface, the intensities, or both."""
     mesh_file, truth, holdout = given.what, given.scans, given.holdout
     radar_map = load_map(mesh_file) if is_map(mesh_file) else None
     if radar_map is None:
@@ -97,19 +95,16 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
     left_out = len(every_ray) - len(inside)
     line = f"{left_out} of {len(every_ray)} held-out returns are skipped: outliers, or in no tile"
     results.add(line if left_out else None, not_compared=left_out)
-    (x, sensors), measured = inside.in_world(), inside.intensities
-    assert measured is not None
-    assert known.intensities is not None
+    (x, sensors), measured = inside.in_world(), np.asarray(inside.intensities)
     errors = intensity_metrics(found, measured)
     results.add("held-out " + format_metrics(errors), held_out=errors)
-    knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
+    knn = KNNIntensity.chosen(*known.in_world(), np.asarray(known.intensities), known.scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)
     line = f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours"
     results.add(line, knn=metrics | {"neighbours": knn.k, "candidates": knn.candidates})
 
 
 def render(given: Namespace, results: Results) -> None:
-    """Predict scans and write them."""
     out, suffix = given.out, given.out.suffix.lower()
     refuse_if(suffix not in _VIEW_SUFFIXES, f"{out}: a view can be written as {', '.join(_VIEW_SUFFIXES)}")
     refuse_if(given.seed < 0, f"--seed must be at least 0, not {given.seed}")
@@ -145,7 +140,6 @@ def _poses(words: list[str]) -> NDArray[np.float64]:
 
 
 def view(given: Namespace, results: Results) -> None:
-    """Serve the page until Ctrl-C, after printing its address."""
     check_address(given)
     radar_map = load_map(given.map)
     scans, explained = _scans(given, radar_map, results)
@@ -160,7 +154,6 @@ def view(given: Namespace, results: Results) -> None:
 
 
 def report(given: Namespace, results: Results) -> None:
-    """Write the page."""
     lacking = given.holdout and not given.scans
     refuse_if(lacking, f"--holdout {given.holdout} needs the scans: name them after the map")
 
@@ -192,7 +185,6 @@ def add_report(results: Results, path: Path, subject: Subject) -> None:
 
 
 def compare(given: Namespace, results: Results) -> None:
-    """Compare two maps, write coloured surfaces, report changes."""
     out, report = given.out, given.report
     if out is not None:
         checked_suffix(out, MESH_SUFFIXES, "meshes")
@@ -235,7 +227,6 @@ def compare(given: Namespace, results: Results) -> None:
 
 
 def grid(given: Namespace, results: Results) -> None:
-    """Build the grid, write its files, and draw a picture if asked for."""
     out, heights = given.out, given.heights
     flat = [path for path in out if path.suffix.lower() == ".yaml"]
     for path in out:

@@ -18,11 +18,13 @@ def refuse_if(wrong: object, message: str) -> None:
 class Parser(argparse.ArgumentParser):
     """Parser of the arguments of a command, or of a step such as ``tiles fit``."""
 
-    def __init__(self, command: str, usage: str = "", text: str = "") -> None:
-        super().__init__(f"radarsdf {command}", usage or None, text, allow_abbrev=False)
+    def __init__(self, command: str) -> None:
+        _, arguments, text, names_and_groups = ENTRIES[command]
+        usage = " ".join(filter(None, ("radarsdf", command, arguments, "[OPTIONS]...")))
+        super().__init__(f"radarsdf {command}", usage, text, allow_abbrev=False)
         # Before Python 3.14, argparse takes -1e-5 for an option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
-        for group in OF_COMMANDS[command].split():
+        for group in names_and_groups.split():
             options = self.add_argument_group(group) if group in GROUPS else self
             for name in GROUPS.get(group, group).split():
                 kind, text = OPTIONS.get(f"{command} {name}") or OPTIONS[name]
@@ -39,31 +41,6 @@ class _Corners(argparse.Action):
         setattr(namespace, self.dest, [values[:3], values[3:]])
 
 
-OF_COMMANDS = {
-    "demo": "--scene --frames -o --view results surface settings",
-    "check": "results reading settings",
-    "fit": "-o --dry-run --holdout --refine --geometry-only --no-check --checkpoint --report results reading settings",
-    "mesh": "map -o --box --viewpoint --picture results surface",
-    "poses": "-o --find --picture results reading settings",
-    "calibrate": "-o results reading settings",
-    "locate": "map -o --guess results reading",
-    "join": "sessions -o results settings",
-    "live": "-o --ros2 --ros2-odom --ros2-domain --in --trajectory --rate --find --view --foxglove --mcap --rerun --rrd results reading page settings",
-    "view": "map --locate --open --box --quiet reading page surface",
-    "report": "map -o --locate --holdout --box results reading surface",
-    "eval": "what --samples --holdout --box results reading surface",
-    "render": "map --pose -o --returns --noise --seed results",
-    "compare": "map -o --report --view --align --min-area --box results reading page",
-    "grid": "map -o --voxel --box --heights --distances --costmap --picture results",
-    "convert": "-o results reading",
-    "config": "settings",
-    "info": "map results",
-    "tiles run": "-o tiles workers results reading surface settings",
-    "tiles plan": "-o tiles workers results reading settings",
-    "tiles fit": "folder --tile workers results",
-    "tiles mesh": "folder -o results surface",
-    "tiles status": "folder --tile results",
-}
 GROUPS = {
     "results": "--quiet --json",
     "reading": "scans poses --extrinsic --topic --pose-topic --imu-topic --imu-rotation --field --columns --max-gap "
@@ -206,48 +183,58 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "--processes": (_COUNT, "worker processes; each fits one tile at a time"),
     "--cluster": ({"metavar": "ADDRESS"}, "address of the dask.distributed scheduler, such as tcp://host:8786"),
 }
-# fmt: on
-
 
 COMMANDS = {
     "Start here": {
-        "demo": ("", "Simulate a drive, fit a map to it, and compare the map with the truth."),
-        "check": ("SCANS [POSES]", "Find mistakes in scans and poses before a fit."),
-        "fit": ("SCANS [POSES] -o MAP", "Fit a map to scans."),
-        "mesh": ("MAP -o MESH", "Extract the surface of a map as a triangle mesh."),
+        "demo": ("fits.demo", "", "Simulate a drive, fit a map to it, and compare the map with the truth.", "--scene --frames -o --view results surface settings"),
+        "check": ("scans.check", "SCANS [POSES]", "Find mistakes in scans and poses before a fit.", "results reading settings"),
+        "fit": ("fits.fit", "SCANS [POSES] -o MAP", "Fit a map to scans.",
+                "-o --dry-run --holdout --refine --geometry-only --no-check --checkpoint --report results reading settings"),
+        "mesh": ("maps.mesh", "MAP -o MESH", "Extract the surface of a map as a triangle mesh.", "map -o --box --viewpoint --picture results surface"),
     },
     "Poses, recordings and large maps": {
-        "poses": ("SCANS [POSES] -o POSES", "Refine the poses of scans, or estimate them from the radar alone."),
-        "calibrate": ("SCANS [POSES] [-o MOUNTINGS]", "Estimate how several radars are mounted, and their time offsets."),
-        "locate": ("MAP SCANS -o POSES", "Find the poses of scans in a map that was made before."),
-        "join": ("SCANS SCANS... -o FOLDER", "Place several sessions at one place in one frame."),
-        "live": ("[SCANS [POSES]]", "Replay a recording into a growing map, or map running ROS 2 topics."),
-        "tiles": ("SCANS [POSES] -o FOLDER", "Fit a map larger than memory in tiles, locally or on a cluster."),
+        "poses": ("scans.poses", "SCANS [POSES] -o POSES", "Refine the poses of scans, or estimate them from the radar alone.",
+                  "-o --find --picture results reading settings"),
+        "calibrate": ("scans.calibrate", "SCANS [POSES] [-o MOUNTINGS]", "Estimate how several radars are mounted, and their time offsets.",
+                      "-o results reading settings"),
+        "locate": ("scans.locate", "MAP SCANS -o POSES", "Find the poses of scans in a map that was made before.", "map -o --guess results reading"),
+        "join": ("scans.join", "SCANS SCANS... -o FOLDER", "Place several sessions at one place in one frame.", "sessions -o results settings"),
+        "live": ("live.live", "[SCANS [POSES]]", "Replay a recording into a growing map, or map running ROS 2 topics.",
+                 "-o --ros2 --ros2-odom --ros2-domain --in --trajectory --rate --find --view --foxglove --mcap --rerun --rrd results reading page settings"),
+        "tiles": ("tiles", "SCANS [POSES] -o FOLDER", "Fit a map larger than memory in tiles, locally or on a cluster.", ""),
     },
     "Uses of a map": {
-        "view": ("MAP [SCANS [POSES]]", "Show a map in the browser, with a draggable sensor."),
-        "report": ("MAP [SCANS [POSES]] -o PAGE", "Write a page about a map: pictures, errors, plots, settings."),
-        "eval": ("MAP|MESH TRUTH [POSES]", "Print the errors of a mesh or a map."),
-        "render": ("MAP --pose X Y Z -o VIEW", "Predict the scan that the radar would get from other poses."),
-        "compare": ("MAP LATER [POSES]", "Report what appeared, disappeared, moved or changed its reflectance."),
-        "grid": ("MAP -o GRID", "Write occupied, free and unknown space for planners: OctoMap, map_server, costmap."),
+        "view": ("maps.view", "MAP [SCANS [POSES]]", "Show a map in the browser, with a draggable sensor.", "map --locate --open --box --quiet reading page surface"),
+        "report": ("maps.report", "MAP [SCANS [POSES]] -o PAGE", "Write a page about a map: pictures, errors, plots, settings.",
+                   "map -o --locate --holdout --box results reading surface"),
+        "eval": ("maps.evaluate", "MAP|MESH TRUTH [POSES]", "Print the errors of a mesh or a map.", "what --samples --holdout --box results reading surface"),
+        "render": ("maps.render", "MAP --pose X Y Z -o VIEW", "Predict the scan that the radar would get from other poses.",
+                   "map --pose -o --returns --noise --seed results"),
+        "compare": ("maps.compare", "MAP LATER [POSES]", "Report what appeared, disappeared, moved or changed its reflectance.",
+                    "map -o --report --view --align --min-area --box results reading page"),
+        "grid": ("maps.grid", "MAP -o GRID", "Write occupied, free and unknown space for planners: OctoMap, map_server, costmap.",
+                 "map -o --voxel --box --heights --distances --costmap --picture results"),
     },
     "Files and settings": {
-        "convert": ("SCANS [POSES] -o FILE", "Write scans as one file or one point cloud, or a mesh in another format."),
-        "config": ("", "Print every setting of a fit with its meaning, as a TOML file for --config."),
-        "info": ("[MAP]", "Print versions and threads for bug reports, and the contents of a map."),
+        "convert": ("scans.convert", "SCANS [POSES] -o FILE", "Write scans as one file or one point cloud, or a mesh in another format.", "-o results reading"),
+        "config": ("settings.config", "", "Print every setting of a fit with its meaning, as a TOML file for --config.", "settings"),
+        "info": ("settings.info", "[MAP]", "Print versions and threads for bug reports, and the contents of a map.", "map results"),
     },
-}  # fmt: skip
-"""Arguments and help of each command, by heading of the overview."""
+}
+"""Function in the package, arguments, help and options of each command, by heading of the overview."""
 
 TILE_STEPS = {
-    "run": ("SCANS [POSES] -o FOLDER", "Plan, fit and mesh in one go; run is the default step."),
-    "plan": ("SCANS [POSES] -o FOLDER", "Read the scans once, and write the rays of each tile."),
-    "fit": ("FOLDER", "Fit the tiles of a plan; finished ones are kept."),
-    "mesh": ("FOLDER", "Write the surface of all tiles as one mesh."),
-    "status": ("FOLDER", "List unfinished tiles with the reasons; exit status 1 if there are any."),
+    "run": ("tiles.run", "SCANS [POSES] -o FOLDER", "Plan, fit and mesh in one go; run is the default step.", "-o tiles workers results reading surface settings"),
+    "plan": ("tiles.plan", "SCANS [POSES] -o FOLDER", "Read the scans once, and write the rays of each tile.", "-o tiles workers results reading settings"),
+    "fit": ("tiles.fit", "FOLDER", "Fit the tiles of a plan; finished ones are kept.", "folder --tile workers results"),
+    "mesh": ("tiles.mesh", "FOLDER", "Write the surface of all tiles as one mesh.", "folder -o results surface"),
+    "status": ("tiles.status", "FOLDER", "List unfinished tiles with the reasons; exit status 1 if there are any.", "folder --tile results"),
 }
-"""Arguments and help of each step of ``radarsdf tiles``."""
+"""The same of each step of ``radarsdf tiles``."""
+# fmt: on
+
+ENTRIES = {name: entry for commands in COMMANDS.values() for name, entry in commands.items()}
+ENTRIES |= {f"tiles {step}": entry for step, entry in TILE_STEPS.items()}
 
 
 def overview() -> str:
@@ -272,5 +259,5 @@ Usage: radarsdf tiles [STEP] [OPTIONS]...
 radarsdf tiles STEP --help lists the options of a step."""
 
 
-def _rows(commands: dict[str, tuple[str, str]]) -> str:
-    return "\n".join(f"  {name:<11}{text}" for name, (_, text) in commands.items())
+def _rows(commands: dict[str, tuple[str, str, str, str]]) -> str:
+    return "\n".join(f"  {name:<11}{text}" for name, (_, _, text, _) in commands.items())

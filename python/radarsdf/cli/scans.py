@@ -50,14 +50,15 @@ def warn_or_refuse(scans: Scans) -> None:
 
 
 def poses(given: Namespace, results: Results) -> None:
-    """Refine or estimate the poses of the scans, and write them."""
     out, picture = given.out, given.picture
     refuse_if(given.find and given.poses, f"--find does not use poses: leave out {given.poses}")
     check_poses_out(given, picture)
     if picture is not None:
         require("matplotlib", what="pictures need")
     config = load_config(given)
-    scans, posed = posed_scans(given, config, results, refine=True, find=given.find, times_for=out)
+    scans, unposed = scans_or_unposed(given, find=given.find)
+    check_pose_times(out, scans.times_s)
+    scans, posed = posed_scans(scans, unposed, config, results, refine=True)
     write_posed(out, scans, results, f"there are {posed.segments} segments" if posed.segments > 1 else "")
     if picture is not None:
         given_poses = {} if posed.given is None else {"given": posed.given}
@@ -88,21 +89,9 @@ def write_posed(out: Path, scans: Scans, results: Results, incomplete: str) -> N
 
 
 def posed_scans(
-    given: Namespace,
-    config: FitConfig,
-    results: Results,
-    *,
-    refine: bool,
-    find: bool = False,
-    times_for: Path | None = None,
+    scans: Scans, unposed: bool, config: FitConfig, results: Results, *, refine: bool
 ) -> tuple[Scans, PosedScans]:
-    """Read scans; estimate their poses with `find` or if there are none, or `refine` them.
-
-    Of a trajectory in several segments, the scans of the longest one are returned. `times_for`: the file of poses to write.
-    """
-    scans, unposed = scans_or_unposed(given, find=find)
-    if times_for is not None:
-        check_pose_times(times_for, scans.times_s)
+    """Estimate the poses of `unposed` scans, or `refine` those of others. Of several segments, return the scans of the longest one."""
     if unposed:
         found = radarsdf.odometry(scans, config=config)
         results.add(found.report["verdict"], poses=found.report)
@@ -128,7 +117,6 @@ def posed_scans(
 
 
 def calibrate(given: Namespace, results: Results) -> None:
-    """Estimate the mountings of the radars, print them with deviations, and write them."""
     if given.out is not None:
         checked_suffix(given.out, (".json",), "mountings to write")
     check_outputs([given.out], inputs_of(given))
@@ -166,7 +154,6 @@ def _with_deviations(values: Iterable[float], sigmas: Iterable[float], digits: i
 
 
 def convert(given: Namespace, results: Results) -> None:
-    """Read the input and write it in the format of the output's suffix."""
     out, folder = given.out, given.scans.resolve()
     check_outputs([out], inputs_of(given))
     if given.poses is None and holds_mesh(given.scans):
@@ -197,7 +184,6 @@ def add_scans(results: Results, out: Path, scans: Scans) -> None:
 
 
 def locate(given: Namespace, results: Results) -> None:
-    """Localise the scans in the map, print what was found, and write the poses of the scans that were."""
     out = given.out
     check_poses_out(given)
     guess = None
@@ -234,7 +220,6 @@ def located(
 
 
 def join(given: Namespace, results: Results) -> None:
-    """Find the poses of the sessions in one frame, and write those that belong together."""
     folder, paths = given.out, given.sessions
     refuse_if(len(paths) < 2, "join takes at least two sessions")
     names = [f"{path.resolve().stem}.npz" for path in paths]

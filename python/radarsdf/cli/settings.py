@@ -11,7 +11,6 @@ from radarsdf.config.fit_config import FitConfig, read_toml, to_toml
 
 
 def config(given: Namespace, results: Results) -> None:
-    """Print the settings as TOML."""
     results.add(to_toml(load_config(given)).rstrip("\n"))
 
 
@@ -56,7 +55,6 @@ def versions() -> dict[str, str]:
 
 
 def info(given: Namespace, results: Results) -> None:
-    """Print one row per component."""
     rows: dict[str, Any] = {name.replace(" ", "_"): value for name, value in versions().items()}
     if given.map is not None:
         from radarsdf.cli.inputs import load_map

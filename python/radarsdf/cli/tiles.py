@@ -31,7 +31,6 @@ def run(given: Namespace, results: Results) -> int:
 
 
 def plan(given: Namespace, results: Results) -> None:
-    """Read the scans once, and write the rays that cross each tile to its file."""
     _check_where(given)
     config = load_config(given)
     scans = read_scans(given)
@@ -74,7 +73,6 @@ def _executor(given: Namespace) -> AbstractContextManager[Executor | None]:
 
 
 def fit(given: Namespace, results: Results) -> int:
-    """Fit the tiles of a plan."""
     with _executor(given) as executor:
         city = run_fits(given.folder, executor=executor, names=given.tile, progress=results.progress)
     results.add(f"{city} in {given.folder}", tiles_done=len(city.tiles))

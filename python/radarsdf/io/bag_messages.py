@@ -23,14 +23,14 @@ from radarsdf.scans import Columns, Notes
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ARS548_DEFINITION = (
     "float32 azimuth; float32 azimuth_std; {} invalid; float32 elevation; float32 elevation_std; float32 range; "
     "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
     "uint8 multi_target; uint16 object; uint8 ambiguity"
 )
 _DEFINITIONS = {
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "tf/msg/tfMessage": "geometry_msgs/TransformStamped[] transforms",
+    **dict.fromkeys(TRANSFORM_TYPES, "geometry_msgs/TransformStamped[] transforms"),
     "radar_msgs/msg/RadarReturn": (
         "float32 range; float32 azimuth; float32 elevation; float32 doppler_velocity; float32 amplitude"
     ),
@@ -63,11 +63,9 @@ _NOT_MEASURED = -1.0  # a variance of sensor_msgs/Imu that marks a missing measu
 
 
 class Topic(NamedTuple):
-    """A topic, with its messages in all bags."""
-
     name: str
     message_type: str
-    num_messages: int
+    num_messages: int  # in all bags
 
 
 class Pose(NamedTuple):
@@ -204,7 +202,6 @@ _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _ars548_packets,
 }
-TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _GEOMETRY = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
 _POSES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/{name}" for name in _GEOMETRY))
 CLOUD_TYPES, POSE_TYPES = tuple(_CLOUDS), (*_POSES, PATH)
@@ -225,11 +222,6 @@ def is_bag(path: Path) -> bool:
     listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
     files = [file.name for file in path.iterdir() if file.suffix.lower() in BAG_SUFFIXES]
     return not files or any(name in listed for name in files)
-
-
-def bags_in(folder: Path) -> list[Path]:
-    """Bags in a folder, sorted by name."""
-    return sorted(path for path in folder.iterdir() if is_bag(path) and not path.name.startswith("."))
 
 
 def topics_of(paths: list[Path]) -> dict[str, Topic]:
@@ -334,10 +326,8 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # damaged bags raise exceptions of many kinds, including OSError
         raise _damaged(path, error) from error
-    try:
+    with closing(reader):
         yield reader
-    finally:
-        reader.close()
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:

@@ -5,7 +5,7 @@ import itertools
 import re
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -42,7 +42,11 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     request.refuse(f"{request.notes.about}: messages have names of columns", "columns")
     topics = bag_messages.topics_of(paths)
     scan_topics = _scan_topics(topics, request)
-    peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
+    peeked: dict[str, list[Message]] = {}
+    for name in (topic.name for topic in scan_topics):
+        with closing(read_messages(paths, {name}, request.notes)) as messages:
+            peeked[name] = list(itertools.islice(messages, _PEEKED_SCANS))
+        check(peeked[name], f"{paths[0]}: {name} has no messages that can be read{request.notes.ending()}")
     counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
     clocks = {}
@@ -59,13 +63,25 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
         return streams[0] if radars is None else map(radars.labelled, merged)
 
+    def find_given(known: Poses) -> FindPoses:
+        """Poses passed by the user, of the body of several radars or else of the most frequent frame among the first scans."""
+        mounted = None if radars is None or request.extrinsic is not None else radars.mounted
+        if isinstance(known, (np.ndarray, NumberedPoses)):  # in the order of the scans
+            count = scan_topics[0].num_messages if len(scan_topics) == 1 else sum(1 for _ in raw_scans())
+            numbered_poses, _ = scan_poses(known, count, None, request.extrinsic, request)
+            of_frames = {frame: poses_on(numbered_poses, T) for frame, T in (mounted or {}).items()}
+            return of_frames.get if of_frames else lambda _: numbered_poses
+        if known is UNPOSED:
+            return lambda _: known
+        base = radars.body if radars is not None and mounted else frames[0]
+        return transforms_in(paths, request).attach(known, base, request)
+
     if in_bag:
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
         request.refuse("poses are given", "pose_topic", "world_frame")
-        known = poses_of(poses, request.notes)
-        find = _user_poses(known, paths, scan_topics, frames, radars, raw_scans, request)
+        find = find_given(poses_of(poses, request.notes))
     imu_topic, recorded = _imu_topic(topics, request), clocks[scan_topics[0].name].recorded
     body = frames[0] if radars is None else radars.body
     imu = partial(_read_imu, paths, imu_topic, body, recorded, request) if imu_topic else lambda: None
@@ -113,31 +129,6 @@ class _Radars:
         return known if len(known) == len(frames) else None
 
 
-def _user_poses(
-    poses: Poses,
-    paths: list[Path],
-    topics: list[Topic],
-    frames: list[str],
-    radars: _Radars | None,
-    raw_scans: Callable[[], Iterator[RawScan]],
-    request: Request,
-) -> FindPoses:
-    """Poses passed by the user: in the order of the scans, or by time.
-
-    They are those of the body of several radars, or else of the most frequent frame among the first scans.
-    """
-    mounted = None if radars is None or request.extrinsic is not None else radars.mounted
-    if isinstance(poses, (np.ndarray, NumberedPoses)):
-        count = topics[0].num_messages if len(topics) == 1 else sum(1 for _ in raw_scans())
-        numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
-        of_frames = {frame: poses_on(numbered_poses, T) for frame, T in (mounted or {}).items()}
-        return of_frames.get if of_frames else lambda _: numbered_poses
-    if poses is UNPOSED:
-        return lambda _: poses
-    base = radars.body if radars is not None and mounted else frames[0]
-    return transforms_in(paths, request).attach(poses, base, request)
-
-
 def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
     """Topics of the scans: those requested, or the only candidate. The others are noted."""
     about = request.notes.about
@@ -168,13 +159,6 @@ def _listed(topics: Iterable[Topic]) -> str:
 
 def _is_radar(topic: Topic) -> bool:
     return bool(_RADAR.search(f"{topic.name} {topic.message_type}"))
-
-
-def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
-    with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
-        peeked = list(itertools.islice(messages, _PEEKED_SCANS))
-    check(peeked, f"{paths[0]}: {topic.name} has no messages that can be read{request.notes.ending()}")
-    return peeked
 
 
 def _raw_scans(paths: list[Path], topic: Topic, clock: Clock, request: Request) -> Iterator[RawScan]:

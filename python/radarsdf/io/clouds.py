@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from radarsdf.arrays import Array, Floats, Floats32
 from radarsdf.checks import AnyPath, check, path_of
 from radarsdf.extras import require
-from radarsdf.io.fields import SIGMA, Fields, columns_of, names_of
+from radarsdf.io.columns import SIGMA, Fields, as_numbers, columns_of, names_of, read_table
 from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, reading, whole_file
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import as_numbers, read_table
 from radarsdf.scans import Columns, Notes, Scans
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
@@ -31,7 +30,6 @@ _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a PCD header has eleven lines
 _PCD_TYPES = {f"<{kind}{size}" for kind in "iuf" for size in (1, 2, 4, 8)} - {"<f1"}
 _LITERALS = 32  # a control byte below this precedes that many literal bytes, plus one
 _LONG = 7  # largest length of three bits: the next byte is added to it
-_PLY_HEADER_BYTES = 1 << 16
 _KITTI_WIDTH, _INSPECTED_FILES = 4, 20  # columns, and number of .bin files that are inspected
 _MAX_POSITION_M, _DAMAGED = 1e7, 0.02  # limit of coordinates, and share of numbers that may be damaged
 _VARIANCE_RATIO, _MIN_ROWS = 0.8, 30  # limit of the variance left by another width
@@ -141,12 +139,12 @@ def _npy(path: Path, columns: GivenColumns) -> Columns:
 
 
 def _text(path: Path, columns: GivenColumns) -> Columns:
-    table = read_table(path)
-    width = table.values.shape[1]
+    heads, values = read_table(path)
+    width = values.shape[1]
     # CloudCompare writes the column names after a comment sign.
-    named = [head for head in table.heads if len(head) == width and not any(map(str.isdecimal, head))]
+    named = [head for head in heads if len(head) == width and not any(map(str.isdecimal, head))]
     names = named[-1] if named else names_of(width or 3, columns)
-    values = table.values if len(table.values) else np.zeros((0, len(names)))
+    values = values if len(values) else np.zeros((0, len(names)))
     check(values.shape[1] == len(names), f"its header has {len(names)} names for {values.shape[1]} columns")
     check(not (named and columns), "it has names of columns: leave out columns (--columns)")
     return {name: column for name, column in zip(names, values.T, strict=True) if names.count(name) == 1}
@@ -230,13 +228,6 @@ def ply_bytes(path: Path) -> io.BytesIO:
     """Load a PLY file for trimesh, without the comments of its header, which may be in any encoding."""
     head, end, body = path.read_bytes().partition(b"end_header")
     return io.BytesIO(re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]*[\r\n]+", b"", head) + end + body)
-
-
-def has_faces(path: Path) -> bool:
-    """Whether the header of a PLY file declares faces."""
-    with path.open("rb") as file:
-        header = file.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
-    return re.search(rb"element\s+face\s+0*[1-9]", header) is not None
 
 
 def _ply(path: Path, _: GivenColumns) -> Columns:
@@ -375,10 +366,6 @@ def write_cloud(path: AnyPath, scans: Scans) -> int:
     return len(columns["scan"])
 
 
-def _write_ply(file: BinaryIO, rows: Array) -> None:
-    file.write(ply_header(rows.dtype, len(rows)) + rows.tobytes())
-
-
 def _write_pcd(file: BinaryIO, rows: Array) -> None:
     names = rows.dtype.names or ()
     kinds = [rows.dtype[name].str[1:] for name in names]
@@ -444,8 +431,8 @@ def ply_header(dtype: np.dtype[Any], count: int, num_faces: int | None = None) -
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-_WRITERS: dict[str, Callable[[BinaryIO, Array], None]] = {
-    ".ply": _write_ply,
+_WRITERS: dict[str, Callable[[BinaryIO, Array], Any]] = {
+    ".ply": lambda file, rows: file.write(ply_header(rows.dtype, len(rows)) + rows.tobytes()),
     ".pcd": _write_pcd,
     ".las": partial(_write_las, False),
     ".laz": partial(_write_las, True),

@@ -15,10 +15,10 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check, check_pose
+from radarsdf.io.columns import read_numbers, read_text
 from radarsdf.io.files import reading
 from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
 from radarsdf.io.recordings import Request, first_file, lidar_map, natural, read_files
-from radarsdf.io.text import read_numbers, read_text
 from radarsdf.scans import Scans
 
 
@@ -97,12 +97,6 @@ def _delft_pose(frame: str, radar: Path, lidar: Path, extrinsic: Floats | None) 
     return np.asarray(T_map_camera @ T_camera_radar)
 
 
-# The Oculii Eagle of SNAIL-Radar, snail-radar.github.io. The poses are those of its lidar in UTM zone 50R, the world frame.
-#
-#     eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
-#     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
-#     lidar.pcd or lidar.ply                      optional: ground truth
-
 _SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl")  # the first that exists is read
 
 # The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source:
@@ -115,6 +109,7 @@ _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
 
 
 def _snail_radar(folder: Path, request: Request) -> Scans:
+    """Read the Oculii Eagle (forward, left, up) of snail-radar.github.io: poses of the lidar in UTM zone 50R, the world frame."""
     points = next(folder / radar for radar in _SNAIL_RADARS if (folder / radar).is_dir())
     if request.poses is None:
         path = folder / "utm50r_T_xt32.txt"

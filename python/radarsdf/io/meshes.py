@@ -1,6 +1,7 @@
 """Read and write meshes, in double precision if the format has it; read ground truth of any kind; GLB, the binary form of glTF 2.0."""
 
 import json
+import re
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from radarsdf.arrays import Array, Bytes, Floats
 from radarsdf.checks import AnyPath, check, path_of, positions
-from radarsdf.io.clouds import face_records, has_faces, ply_bytes, ply_header, read_points, records
+from radarsdf.io.clouds import face_records, ply_bytes, ply_header, read_points, records
 from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, write_whole
 from radarsdf.io.npz import TRUTH_ARRAYS, arrays_of
 from radarsdf.scans import Columns
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
+_PLY_HEADER_BYTES = 1 << 16
 _SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 _SRGB = np.arange(256) / 255
@@ -40,9 +42,11 @@ def holds_mesh(path: AnyPath) -> bool:
     """Whether a file is a mesh, by its suffix; for PLY, which may be a cloud too, by its header."""
     file = Path(path)
     suffix = file.suffix.lower()
-    if suffix == ".ply":
-        return file.is_file() and has_faces(file)
-    return suffix in MESH_SUFFIXES and not file.is_dir()
+    if suffix != ".ply" or not file.is_file():
+        return suffix in set(MESH_SUFFIXES) - {".ply"} and not file.is_dir()
+    with file.open("rb") as opened:
+        header = opened.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
+    return re.search(rb"element\s+face\s+0*[1-9]", header) is not None
 
 
 def write_mesh(path: AnyPath, mesh: "trimesh.Trimesh") -> None:
@@ -119,14 +123,13 @@ def read_mesh(path: AnyPath) -> "trimesh.Trimesh":
 def read_ground_truth(path: AnyPath) -> Floats:
     """Read points (M, 3), world, m, of a cloud or ``.npz`` file, or sample a mesh: the same file gives the same points."""
     file = Path(path)
-    suffix = file.suffix.lower()
     if holds_mesh(file):
         mesh = read_mesh(file)
         check(mesh.area > 0, f"{path} has no surface")
         # By area, in the order of the triangles, so that each large triangle gets points.
         samples: Any = mesh.sample(_SAMPLES, return_index=True, seed=0)
         return np.asarray(samples[0], np.float64)
-    if suffix == ".npz":
+    if file.suffix.lower() == ".npz":
         names = (*TRUTH_ARRAYS, "points")
         arrays = arrays_of(file, names)
         check(arrays, f"{path} has no ground truth: it lacks an array {' or '.join(names)}")

@@ -103,13 +103,13 @@ def _check_scans(arrays: Mapping[str, Array]) -> None:
         first, *rest = _SHAPES.get(name, (None, *array.shape[1:]))
         expected = (*known.get(str(first), array.shape[:1]), *rest)
         check(array.shape == expected, f"{name} must have shape {expected}, not {array.shape}")
-    _check_rows("frame", arrays["frame"], len(arrays["poses"]), "poses")
-    _check_rows("sensor", arrays.get("sensor", np.zeros(len(labels))), len(labels), "sensor_labels")
-
-
-def _check_rows(name: str, rows: Array, count: int, of: str) -> None:
-    fits = (rows == np.floor(rows)) & (rows >= 0) & (rows < count)
-    check(fits.all(), f"{name} must hold row indices of the {count} {of}")
+    for name, of, count in (
+        ("frame", "poses", len(arrays["poses"])),
+        ("sensor", "sensor_labels", len(labels)),
+    ):
+        rows = arrays.get(name, np.zeros(count))
+        fits = (rows == np.floor(rows)) & (rows >= 0) & (rows < count)
+        check(fits.all(), f"{name} must hold row indices of the {count} {of}")
 
 
 def write_scans(path: AnyPath, scans: Scans) -> None:

@@ -24,9 +24,9 @@ from radarsdf.checks import (
     pose_matrices,
     real_array,
 )
+from radarsdf.io.columns import in_seconds, read_numbers, read_table, read_text, scaled, without_unit
 from radarsdf.io.files import check_regular_file, checked_suffix, reading, write_whole
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import Table, in_seconds, read_numbers, read_table, read_text, scaled, without_unit
 from radarsdf.scans import Columns, Notes
 
 MAX_GAP_S = 0.5  # longest gap to interpolate across, by default
@@ -203,7 +203,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     if path.suffix.lower() == ".npy":
         return rigid_or_nan(np.array(array_in(path)), str(path), notes)
     with reading(path, "a table of poses"):
-        columns = _pose_columns(read_table(path))
+        columns = _pose_columns(*read_table(path))
     times = columns.get("time")
     if "qw" in columns:
         rows = np.column_stack([columns[role] for role in _TUM[1:]])
@@ -233,14 +233,13 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     return trajectory_of(np.column_stack([times, rows]), str(path), notes)
 
 
-def _pose_columns(table: Table) -> Columns:
+def _pose_columns(table_heads: list[list[str]], values: Floats) -> Columns:
     """Columns by role, in s and m: of a quaternion or of a matrix, and ``time`` or the number of the scan, if there is one."""
-    values = table.values
     check(len(values), "it has no rows of numbers")
     if values.shape[1] == 4 and len(values) % 4 == 0:  # blocks of four lines
         values = values.reshape(-1, 16)
     width = values.shape[1]
-    heads = [head for head in reversed(table.heads) if len(head) == width]
+    heads = [head for head in reversed(table_heads) if len(head) == width]
     for names in heads:
         roles = [_role_of(name) for name in names]
         if set(_TUM[1:]) <= set(roles):

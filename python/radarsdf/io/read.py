@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from radarsdf.checks import AnyPath, check, check_pose, path_of, positions, positive
 from radarsdf.io import datasets, recordings
 from radarsdf.io import poses as pose_files
-from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
+from radarsdf.io.bag_messages import BAG_SUFFIXES, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import READERS, read_points
-from radarsdf.io.fields import columns_of
+from radarsdf.io.columns import columns_of
 from radarsdf.io.npz import read_scans
 from radarsdf.rig import checked_rotation
 from radarsdf.scans import Notes, Scans
@@ -154,7 +154,8 @@ def _read(path: Path, request: recordings.Request) -> Scans:
     if is_bag(path):
         return read_bags([path], request)
     dataset = datasets.find(path) if path.is_dir() else None
-    bags = bags_in(path) if path.is_dir() and dataset is None else []
+    inner = sorted(path.iterdir()) if path.is_dir() and dataset is None else []
+    bags = [entry for entry in inner if is_bag(entry) and not entry.name.startswith(".")]
     if bags:  # NTU4DRadLM and Viking Hill have files next to them
         if request.extrinsic is None:
             T_base_sensor = pose_files.read_transform(path / recordings.BASE_T_RADAR)

@@ -19,7 +19,7 @@ import numpy as np
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, UNNAMED, check_kitti, read_columns, read_points
-from radarsdf.io.fields import Fields
+from radarsdf.io.columns import Fields, in_seconds, read_numbers, read_table, scaled, unit_since_1970
 from radarsdf.io.files import reading
 from radarsdf.io.poses import (
     FIND_POSES,
@@ -34,7 +34,6 @@ from radarsdf.io.poses import (
     poses_of,
     read_transform,
 )
-from radarsdf.io.text import in_seconds, read_numbers, read_table, scaled, unit_since_1970
 from radarsdf.rig import Label
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
@@ -295,7 +294,8 @@ def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path],
 def _listed_times(path: Path, notes: Notes) -> list[float]:
     """Times, s, of a file with one line per scan, in the unit of their column's name, if it has one."""
     table = read_numbers(path)
-    names = next((head for head in reversed(read_table(path).heads) if len(head) == table.shape[1]), [""])
+    heads, _ = read_table(path)
+    names = next((head for head in reversed(heads) if len(head) == table.shape[1]), [""])
     with reading(path, "a list of times"):
         times = scaled(table[:, -1], names[-1], "time")
     times = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else times

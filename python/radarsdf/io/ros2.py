@@ -249,11 +249,10 @@ class _Poses:
 class _Listener:
     """Receives scans and poses in its own thread, and keeps the last scans until they are taken."""
 
-    def __init__(
-        self, node: Node, topics: list[str], request: Request, poses: _Poses, stopped: Callable[[], bool]
-    ) -> None:
-        self._node, self._topics, self._request, self._poses = node, topics, request, poses
-        self._stopped = stopped
+    def __init__(self, node: Node, topics: list[str], request: Request, stopped: Callable[[], bool]) -> None:
+        self._node, self._topics, self._request, self._stopped = node, topics, request, stopped
+        self._poses = _Poses(request)
+        self._frames = self._poses.frames
         self._readers: dict[str, tuple[str, Any]] = {}
         self._clocks: dict[str, Clock] = {}
         self._error: Exception | None = None
@@ -263,23 +262,23 @@ class _Listener:
 
     @property
     def dropped(self) -> int:
-        """Number of scans that were never taken."""
+        """Number of scans that arrived faster than they were taken, or before the mountings."""
         return self._received - self._taken - len(self._queue)
 
-    def wait(self) -> None:
+    def _wait(self) -> None:
         """Wait for more messages. Raise the error of the thread, if there is one."""
         if self._error is not None:
             raise self._error
         time.sleep(_STEP_S)
 
-    def take(self) -> Iterator[tuple[float, RawScan]]:
+    def _take(self) -> Iterator[tuple[float, RawScan]]:
         """Yield scans and the times of their arrival, by the monotonic clock, until it is stopped."""
         while self._queue or not self._stopped():
             if self._queue:
                 self._taken += 1
                 yield self._queue.popleft()
             else:
-                self.wait()
+                self._wait()
 
     def _listen(self) -> None:
         """Subscribe to topics once they are there, and receive their messages."""
@@ -334,7 +333,7 @@ class _Listener:
         self._queue.append((time.monotonic(), raw))
 
 
-class Subscription:
+class Subscription(_Listener):
     """Scans of running topics, with poses of a topic or of TF; with `find`, or if TF has none, `unposed`. Iteration ends when `stopped`."""
 
     def __init__(
@@ -346,30 +345,18 @@ class Subscription:
         stopped: Callable[[], bool],
         report: Callable[[str], None],
     ) -> None:
-        self._node, self._topics, self._request = node, list(dict.fromkeys(topics)), request
-        self._stopped, self._report = stopped, report
-        self._poses = _Poses(request)
-        self._frames = self._poses.frames
-        self._listener = _Listener(node, self._topics, request, self._poses, stopped)
-        self.unposed = find
+        super().__init__(node, list(dict.fromkeys(topics)), request, stopped)
+        self._report, self.unposed = report, find
         self._await_poses()
         self._assumed = self._is_assumed()
-        known, mounted = self._poses.known(), self._mounted()
+        known = self._poses.known()
         for line in () if self.unposed else known.notes:
             request.notes.add(line)
-        # By topic, of several radars.
-        self.T_body_sensor: dict[Label, Floats] | None = (
-            mounted if len(self._topics) > 1 and mounted else None
-        )
+        self.T_body_sensor = self._mounted() or None
         self.world = request.world_frame or "map"
         if not self.unposed and self._frames:
             root = known.tree.chain(next(iter(self._frames.values())))[-1]
             self.world = known.topic.parent if known.topic else request.world_frame or root
-
-    @property
-    def dropped(self) -> int:
-        """Number of scans that arrived faster than they were taken, or before the mountings."""
-        return self._listener.dropped
 
     def carrier(self, label: Label | None) -> tuple[str, Floats, bool]:
         """Return the highest frame that TF attaches rigidly to a radar, T_carrier_sensor (4, 4), and whether others publish its pose."""
@@ -403,22 +390,22 @@ class Subscription:
 
     def _raw_scans(self) -> Iterator[RawScan]:
         longest_s = self._request.max_gap_s
-        for arrived_s, raw in self._listener.take():
+        for arrived_s, raw in self._take():
             while time.monotonic() < arrived_s + longest_s and not self._stopped():
                 poses = self._find(raw.frame)
                 if poses is None or poses.pose_at(raw.time_s or 0.0, longest_s) is not None:
                     break
-                self._listener.wait()  # the pose after the scan is yet to come
+                self._wait()  # the pose after the scan is yet to come
             yield raw
 
     def _find(self, frame: str) -> Any:
         return UNPOSED if self.unposed else self._poses.known().find(frame)
 
     def _mounted(self) -> dict[Label, Floats]:
-        """T_body_sensor by topic; empty if TF does not mount all radars on one body."""
+        """T_body_sensor by topic, of several radars; empty if TF does not mount all of them on one body."""
         frames = dict(self._frames)
         _, mounted = self._poses.known().tree.mountings([*frames.values()] or [""])
-        complete = len(mounted) == len(set(frames.values()))
+        complete = len(self._topics) > 1 and len(mounted) == len(set(frames.values()))
         return {topic: mounted[frame] for topic, frame in frames.items()} if complete else {}
 
     def _await_poses(self) -> None:
@@ -437,20 +424,16 @@ class Subscription:
                 found = self._node.published()
                 listed = ", ".join(f"{name} ({', '.join(types)})" for name, types in sorted(found.items()))
                 self._report(f"waiting for {why}; DDS domain {self._node.domain} has {listed or 'no topics'}")
-            self._listener.wait()
+            self._wait()
 
     def _missing(self, *, late: bool) -> str:
         """Return what is missing for the poses of the scans. Only `late`, it is certain that TF has none."""
-        known, several = self._poses.known(), len(self._topics) > 1
-        if (
-            late
-            and self._request.pose_topic is None
-            and isinstance(known.error, NoPoses)
-            and not self.unposed
-        ):
+        known = self._poses.known()
+        without = self._request.pose_topic is None and isinstance(known.error, NoPoses)
+        if late and without and not self.unposed:
             self.unposed = True
             self._request.notes.add("TF has no poses of the radar: they are estimated from its returns")
-        if several and (self.unposed or known.topic) and not self._mounted():
+        if len(self._topics) > 1 and (self.unposed or known.topic) and not self._mounted():
             return f"static transforms that mount {', '.join(self._frames.values())} on one body"
         if self.unposed:
             return ""

@@ -19,8 +19,8 @@ _CHECKSUMS = "crc32"  # key of the metadata: CRC-32 of each tensor by name, and 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
     """Encode tensors as a safetensors file with checksums."""
     tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
-    checksums = {name: _checksum(tensor.numpy()) for name, tensor in tensors.items()}
-    checksums = {"": _metadata_checksum(metadata)} | checksums
+    checksums = {"": _metadata_checksum(metadata)}
+    checksums |= {name: _checksum(tensor.numpy()) for name, tensor in tensors.items()}
     return save(tensors, {**metadata, _CHECKSUMS: json.dumps(checksums)})
 
 

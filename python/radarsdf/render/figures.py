@@ -21,12 +21,9 @@ _MAX_RETURNS = 60_000  # largest number in a picture of trajectories
 def new_figure(**options: Any) -> Any:
     """Create a matplotlib figure that needs no display; `options` are those of ``matplotlib.figure.Figure``."""
     require("matplotlib", what="pictures need")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - an extra
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
-    figure = Figure(**options)
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(**options)
 
 
 def png_of(figure: Any, **options: Any) -> bytes:

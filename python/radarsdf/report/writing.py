@@ -32,7 +32,7 @@ from radarsdf.scans import Scans
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import MEANING, centre_of
-from radarsdf.view.serving import framing_pose, free_port, set_initial_camera, start_server, stop_server
+from radarsdf.view.serving import aim, framing_pose, free_port, start_server, stop_server
 from radarsdf.view.surface import SHARES, Scale, glb, templates_of, thinned
 
 MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
@@ -42,11 +42,8 @@ _STEPS_PER_M = 1024  # vertices are rounded to multiples of 1 m / 1024: fewer di
 _SENSOR_COLOR = (0, 114, 178)
 # The icon holds the only address of another machine in viser's page, though only as the name of an XML namespace.
 _ICON = re.compile(r'<link\s+rel="icon".*?/>', re.DOTALL)
-_FIRST_SIDE = (25.0, 36.0)
-_SIDES = {
-    "One long side": _FIRST_SIDE,
-    "Steeply from above": (0.0, 70.0),  # not straight down: walls would be lines
-}  # azimuth and elevation of each view, degrees
+# Azimuth and elevation of each view, degrees, if they are not the usual ones. Straight down, walls would be lines.
+_SIDES: dict[str, tuple[float, ...]] = {"One long side": (), "Steeply from above": (0.0, 70.0)}
 _FIRST, _SECOND = "#0072b2", "#d55e00"  # distinguishable by colour-blind readers
 _SAMPLES = 1_000_000
 _MATCH_M = 0.4  # a vertex farther from the truth is an outlier rather than an inaccurate surface
@@ -99,13 +96,8 @@ class Subject:
             truth = truth[((truth >= low) & (truth <= high)).all(axis=1)]
         return truth if len(truth) else None
 
-    def nearest_truth(self, vertices: ArrayLike) -> tuple[Floats, Any]:
-        """Distances (V,), m, to the nearest ground-truth points, which must exist, and their rows."""
-        distance_m, rows = self._truth_tree.query(vertices, workers=resolve_num_threads(0))
-        return distance_m, rows
-
     @cached_property
-    def _truth_tree(self) -> Any:
+    def truth_tree(self) -> Any:
         return cKDTree(self.ground_truth)
 
     def picture(self, values: Array, label: str, scale: Scale) -> dict[str, Any]:
@@ -153,32 +145,21 @@ def write_changes_report(
     surface = None
     if len(mesh.faces):
         colors = colors_of(mesh.vertex_attributes["kind"])
-        vertices = np.asarray(mesh.vertices, np.float64)
-        local = vertices - vertices.mean(axis=0)
-        surface = {"scene": scene(local, mesh.faces, colors), "views": views(mesh, colors)}
+        surface = _pictures(mesh, colors, np.asarray(mesh.vertices, np.float64).mean(axis=0))
     values = {"report": changes.report, "regions": regions, "kinds": [NAMES[kind] for kind in CHANGED]}
     return _write_page(path, "changes.html", names=names, surface=surface, key=MEANING, **values)
 
 
 def surface_values(subject: Subject) -> dict[str, Any] | None:
     """Values of the surface section, or None if there is no surface."""
-    mesh, spacing_m = subject.shown
+    mesh, _ = subject.shown
     if len(mesh.faces) == 0:
         return None
     colors, legend = _colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
     origin = subject.radar_map.origin
     sensors = None if subject.scans is None else subject.scans.sensor_poses[:, :3, 3] - origin
-    return {
-        "scene": scene(
-            np.asarray(mesh.vertices, np.float64) - origin, mesh.faces, colors, sensors, subject.explained
-        ),
-        "explained": subject.explained is not None,
-        "legend": legend,
-        "views": views(mesh, colors),
-        "threshold": Threshold.of_mesh(subject.mesh.metadata),
-        "shown_triangles": len(mesh.faces),
-        "spacing_m": spacing_m,
-    }
+    values = {"legend": legend, "threshold": Threshold.of_mesh(subject.mesh.metadata)}
+    return values | _pictures(mesh, colors, origin, sensors, subject.explained)
 
 
 def error_values(subject: Subject) -> dict[str, Any] | None:
@@ -187,7 +168,7 @@ def error_values(subject: Subject) -> dict[str, Any] | None:
     if truth is None or len(mesh.faces) == 0:
         return None
     metrics = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
-    shown_m, _ = subject.nearest_truth(subject.shown[0].vertices)
+    shown_m, _ = subject.truth_tree.query(subject.shown[0].vertices, workers=resolve_num_threads(0))
     pictured = subject.picture(shown_m, "distance to the truth, m", Scale(0.0, _MATCH_M))
     return {"metrics": metrics, **pictured}
 
@@ -214,7 +195,7 @@ def _calibration(subject: Subject, sigma_m: Floats) -> dict[str, Any] | None:
     if truth is None:
         return None
     vertices = np.asarray(mesh.vertices, np.float64)
-    distance_m, nearest = subject.nearest_truth(vertices)
+    distance_m, nearest = subject.truth_tree.query(vertices, workers=resolve_num_threads(0))
     error_m = ((truth[nearest] - vertices) * np.asarray(mesh.vertex_normals)).sum(axis=1)
     error_m[distance_m > _MATCH_M] = np.nan
     if np.count_nonzero(np.isfinite(error_m) & np.isfinite(sigma_m)) < _MIN_MATCHES:
@@ -240,8 +221,7 @@ def intensity_values(subject: Subject) -> dict[str, Any] | None:
     usable = every_ray.select(every_ray.with_intensity)
     rows = np.linspace(0, len(usable) - 1, min(len(usable), _MAX_RETURNS)).astype(np.int64)
     rays, found = predicted(subject.radar_map, usable.select(rows))
-    assert rays.intensities is not None
-    measured = rays.intensities.astype(np.float64)
+    measured = np.asarray(rays.intensities, np.float64)
     metrics = intensity_metrics(found, measured)
     deviation = np.abs(measured - np.median(measured))
     return {
@@ -313,16 +293,20 @@ def _colored(
     return scale(values), {"label": label, "scale": scale}
 
 
-def views(mesh: Any, colors: Bytes) -> dict[str, bytes]:
-    """Render a mesh with vertex colours (V, 3) from each of its sides, by name."""
-    return {name: _picture(mesh, colors, *side) for name, side in _SIDES.items()}
+def _pictures(
+    mesh: Any, colors: Bytes, origin: Floats, sensors: Floats | None = None, explained: Floats | None = None
+) -> dict[str, Any]:
+    """Show a mesh with vertex colours (V, 3) in a :func:`scene` around `origin`, and from each of its sides, by name."""
+    local = np.asarray(mesh.vertices, np.float64) - origin
+    views = {name: _picture(mesh, colors, *side) for name, side in _SIDES.items()}
+    return {"scene": scene(local, mesh.faces, colors, sensors, explained), "views": views}
 
 
-def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
+def _picture(mesh: Any, colors: Bytes, *side: float) -> bytes:
     """Render a mesh with vertex colours (V, 3), seen from :func:`eye_around`, as JPEG."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
-    eye = eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg)
+    eye = eye_around(np.asarray(mesh.vertices, np.float64), *side)
     pixels = render(mesh, colors, width=_WIDTH, height=_HEIGHT, viewpoint=eye)
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format="jpeg", quality=82, optimize=True)
@@ -330,11 +314,7 @@ def _picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float =
 
 
 def scene(
-    vertices: Floats,
-    faces: Array,
-    colors: Bytes,
-    sensors: Floats | None = None,
-    explained: Floats | None = None,
+    vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None, explained: Floats | None
 ) -> str:
     """Export a self-contained HTML page that shows a mesh in 3D, made by viser.
 
@@ -343,7 +323,7 @@ def scene(
     other machines in its program are never used; the report's content security policy forbids fetching them.
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
-    to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
+    to_eye = eye_around(vertices) - middle_of(vertices)[0]
     pose = framing_pose(everything, to_eye, _SCENE_ASPECT)
     host = "127.0.0.1"
     server: Any = start_server(host, free_port(host, 0))
@@ -355,7 +335,7 @@ def scene(
             style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
             sensor_colors = _SENSOR_COLOR if explained is None else SHARES(explained)
             server.scene.add_point_cloud("/sensor", sensors.astype(np.float32), sensor_colors, **style)
-        set_initial_camera(server, pose)
+        aim(server.initial_camera, pose)
         document: str = server.get_scene_serializer().as_html()
     finally:
         stop_server(server)

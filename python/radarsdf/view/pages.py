@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,38 +12,17 @@ from radarsdf.checks import check
 from radarsdf.grids.grid import Grid
 from radarsdf.map.map import Map
 from radarsdf.scans import Scan, Scans
-from radarsdf.view.scene import (
-    HELD_S,
-    POINTS,
-    SCAN_COLORS,
-    SLID_S,
-    Canvas,
-    Painter,
-    ScanClouds,
-    State,
-    add_path,
-)
-from radarsdf.view.serving import FOV_RAD, CameraPose, Page, framing_pose, set_initial_camera
+from radarsdf.view.scene import SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_cloud, add_mesh, add_path
+from radarsdf.view.serving import CameraPose, Page, aim, framing_pose
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
-from radarsdf.view.surface import (
-    SHARES,
-    ShownSurface,
-    as_html,
-    first_hit,
-    glb,
-    lightness_of,
-    quantities_of,
-    shaded,
-    thinned,
-)
-
-if TYPE_CHECKING:
-    import trimesh
+from radarsdf.view.surface import SHARES, ShownSurface, as_html, first_hit, quantities_of, thinned
 
 _GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
 _MARK_SHARE = 0.012  # radius of a click's mark, as a share of its distance: of constant size on the screen
 _MARK_COLOR = (0, 190, 255)  # not on the colour scale
 _MAX_VERTICES = 500_000
+_HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
+_SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
 _MAX_LISTED = 12  # changes
 _NOTES = {"unseen": ": not observed by the other map", "gone": ": of the earlier map"}
 _NAMED_COLORS = [(NAMES[kind], color) for kind, color in sorted(COLORS.items(), reverse=True)]
@@ -65,7 +44,6 @@ class Viewer(Page):
         scans: Scans | None = None,
         *,
         voxel_size: float = 0.1,
-        max_vertices: int = 500_000,
         host: str = "127.0.0.1",
         port: int | None = None,
         explained: Floats | None = None,
@@ -73,7 +51,7 @@ class Viewer(Page):
     ) -> None:
         super().__init__(host, port)
         self._map = radar_map
-        self.surface = ShownSurface.of(radar_map, voxel_size, max_vertices=max_vertices, **wanted)
+        self.surface = ShownSurface.of(radar_map, voxel_size, max_vertices=_MAX_VERTICES, **wanted)
         self._start()
         try:
             self._fill(scans, explained)
@@ -95,7 +73,7 @@ class Viewer(Page):
         origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.sensor_poses[:, :3, 3] - origin
         self._extent = np.concatenate([surface.vertices - origin, path])
-        set_initial_camera(server, framing_pose(self._extent))
+        aim(server.initial_camera, framing_pose(self._extent))
         x, y, z = (origin if scans is None else scans.sensor_poses[0, :3, 3]).tolist()
         self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
         self._clicked: Floats | None = None
@@ -105,8 +83,7 @@ class Viewer(Page):
         self._gizmo: Any = None
         if radar_map.has_intensity:
             self._add_sensor(np.array([x, y, z]) - origin)
-        state = State((x, y, z), **self._surface_state(), scan=None if scans is None else 0)
-        self._painter = Painter(self._canvas, state)
+        self._painter = Painter(self._canvas, State((x, y, z), **self._surface_state()))
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
 
@@ -133,7 +110,7 @@ class Viewer(Page):
             self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
 
         async def on_limit(_: Any) -> None:
-            self._painter.change(**self._surface_state(), coarse=False, settle_s=SLID_S)
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=_SLID_S)
 
         async def on_quantity(_: Any) -> None:
             self._legend.content = as_html("legend", self.quantities[self._quantity.value])
@@ -152,18 +129,20 @@ class Viewer(Page):
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
         colors: dict[str, Any] = {**SCAN_COLORS, "measured": scale or SCAN_COLORS["measured"]}
-        colors |= {} if explained is None else {"trajectory": SHARES}
+        path_color: Any = colors["trajectory"]
+        if explained is not None:
+            colors["trajectory"], path_color = SHARES, SHARES(explained)[:-1, None].repeat(2, axis=1)
         with tab, gui.add_folder("scans"):
             gui.add_html(as_html("key", colors))
             slider = gui.add_slider("scan", 0, max(len(scans) - 1, 1), 1, 0, disabled=len(scans) == 1)
-            clouds = ScanClouds(self._server, self._map, scans, scale, gui.add_markdown(""), explained)
+            clouds = ScanClouds(self._server, self._map, scans, scale, gui.add_markdown(""), path_color)
             boxes = {name: gui.add_checkbox(name, True) for name in colors}
 
         async def on_scan(_: Any) -> None:
             sensor = clouds.sensor(int(slider.value))
             if self._gizmo is not None:
                 self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
-            self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=SLID_S)
+            self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=_SLID_S)
 
         async def on_box(_: Any) -> None:
             for name, box in boxes.items():
@@ -177,19 +156,16 @@ class Viewer(Page):
     def _surface_state(self) -> dict[str, Any]:
         """Fields of :class:`State` set by the controls of the surface. At its maximum, the slider sets no limit."""
         uncertainty_m = self._uncertainty.value
-        return {
-            "max_uncertainty_m": math.inf if uncertainty_m >= self._uncertainty.max else float(uncertainty_m),
-            "min_confidence": float(self._confidence.value),
-            "quantity": str(self._quantity.value),
-        }
+        max_uncertainty_m = math.inf if uncertainty_m >= self._uncertainty.max else float(uncertainty_m)
+        limits = (max_uncertainty_m, float(self._confidence.value))
+        return {"limits": limits, "quantity": str(self._quantity.value)}
 
     def _frame_all(self, client: Any) -> CameraPose:
         camera = client.camera
         pose = framing_pose(self._extent, aspect=_aspect(camera))
         with client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
-            camera.fov = FOV_RAD
-            camera.position, camera.look_at = pose
+            aim(camera, pose)
         return pose
 
     async def _on_connect(self, client: Any) -> None:
@@ -220,7 +196,7 @@ class Viewer(Page):
         async def on_update(event: Any) -> None:
             sensor = self._map.origin + np.asarray(event.target.position, np.float64)
             moving = event.phase != "end"
-            self._painter.change(sensor=tuple(sensor.tolist()), coarse=moving, settle_s=HELD_S * moving)
+            self._painter.change(sensor=tuple(sensor.tolist()), coarse=moving, settle_s=_HELD_S * moving)
 
         self._gizmo.on_update(on_update)
 
@@ -276,26 +252,21 @@ class GrowingView(Page, Sink):
 
     def show_scan(self, scan: Scan, time_s: float) -> None:  # noqa: ARG002
         world = np.concatenate([scan.T_world_sensor[None, :3, 3], scan.world_points])
-        self._add_points("/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
+        add_cloud(self._server, "/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
 
-    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:  # noqa: ARG002
-        local, server, shade = self._local(mesh.vertices), self._server, lightness_of(mesh.vertex_normals)
+    def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:  # noqa: ARG002
+        local, server = self._local(mesh.vertices), self._server
         if not self._framed:
             self._framed = True
-            set_initial_camera(server, framing_pose(local))
-        data = glb(local, mesh.faces, shaded(uncertainty_colors(mesh), shade))
+            aim(server.initial_camera, framing_pose(local))
         with server.atomic():
-            server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
+            add_mesh(server, mesh, local, uncertainty_colors(mesh))
             if len(path) > 1:
                 add_path(server, "/path", self._local(path), PATH_COLOR)
 
     def show_grid(self, grid: Grid, time_s: float) -> None:  # noqa: ARG002
         free = self._local(grid.centres(grid.free))
-        self._add_points("/free space", free, FREE_COLOR, 0.2 * grid.voxel_size)
-
-    def _add_points(self, name: str, local: Floats, color: Any, size_m: float) -> None:
-        points, colors = local.astype(np.float32), np.full(local.shape, color, np.uint8)
-        self._server.scene.add_point_cloud(name, points, colors, point_size=size_m, **POINTS)
+        add_cloud(self._server, "/free space", free, FREE_COLOR, 0.2 * grid.voxel_size)
 
 
 class ChangesView(Page):
@@ -307,12 +278,10 @@ class ChangesView(Page):
         check(len(mesh.faces), "the map has no surface here")
         vertices = np.asarray(mesh.vertices, np.float64)
         local = vertices - vertices.mean(axis=0)  # the page computes in float32
-        colors = shaded(colors_of(mesh.vertex_attributes["kind"]), lightness_of(mesh.vertex_normals))
         self._start()
         server = self._server
-        set_initial_camera(server, framing_pose(local))
-        data = glb(local, mesh.faces, colors)
-        server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
+        aim(server.initial_camera, framing_pose(local))
+        add_mesh(server, mesh, local, colors_of(mesh.vertex_attributes["kind"]))
         listed = regions[:_MAX_LISTED]
         rows = {centre_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in listed}
         server.gui.add_html(as_html("key", MEANING))

@@ -18,10 +18,17 @@ from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
-from radarsdf.view.surface import SHARES, Position, Quantity, Scale, ShownSurface, glb, shaded, spread_evenly
+from radarsdf.view.surface import (
+    Position,
+    Quantity,
+    Scale,
+    ShownSurface,
+    glb,
+    lightness_of,
+    shaded,
+    spread_evenly,
+)
 
-HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
-SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
 # Measured returns without intensities; predictions are not on the intensity scale, and stand out from the surface.
 SCAN_COLORS = {"measured": (0, 72, 140), "predicted": (0, 158, 115), "trajectory": (40, 44, 52)}
 
@@ -30,7 +37,7 @@ _DRAG_POINTS = 30_000
 _POINT_SIZE = 1.4  # size in vertex spacings, which leaves no holes between points
 _STYLES = {"measured": ("circle", 0.25), "predicted": ("diamond", 0.2)}  # size, m
 # In float16, points would lie on a grid of 3 cm at 60 m.
-POINTS = {"point_shading": "flat", "precision": "float32"}
+_POINTS = {"point_shading": "flat", "precision": "float32"}
 
 
 @dataclass(frozen=True)
@@ -38,17 +45,11 @@ class State:
     """State of the controls."""
 
     sensor: Position  # world, m
-    max_uncertainty_m: float
-    min_confidence: float
+    limits: tuple[float, float]  # uncertainty, m, and confidence: arguments of :meth:`ShownSurface.kept`
     quantity: str = ""
-    scan: int | None = None
+    scan: int = 0
     coarse: bool = False  # whether the sensor is moving: show the cloud first
     settle_s: float = 0.0  # draw the mesh if nothing changes for this long
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """The arguments of :meth:`ShownSurface.kept`."""
-        return self.max_uncertainty_m, self.min_confidence
 
 
 class Painter:
@@ -59,7 +60,6 @@ class Painter:
         self.newest = state  # may not be drawn yet
         self._changed = threading.Condition()
         self._pending, self._stopped = True, False
-        self._ended = threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="radarsdf view", daemon=True)
         self._thread.start()
@@ -73,8 +73,8 @@ class Painter:
 
     def wait(self) -> None:
         """Wait for the thread to end. Raises the error that ended it."""
-        while not self._ended.wait(WAIT_STEP_S):
-            pass
+        while self._thread.is_alive():
+            self._thread.join(WAIT_STEP_S)
         if self._error is not None:
             raise self._error
 
@@ -101,8 +101,6 @@ class Painter:
                     self._canvas.show_mesh(state, self._superseded)
         except BaseException as error:  # noqa: BLE001 - `wait` raises it
             self._error = error
-        finally:
-            self._ended.set()
 
 
 class Canvas:
@@ -128,22 +126,15 @@ class Canvas:
         self.sent = 0  # number of meshes so far
         self.faces = surface.faces  # (F, 3) visible triangles, rows of the vertices
         self.coarse = False  # whether the cloud is shown
-        self.node: Any = server.scene.add_frame("/surface", show_axes=False)  # the parent of mesh and cloud
+        server.scene.add_frame("/surface", show_axes=False)  # the parent of mesh and cloud
         self._cloud: Any = None
         if any(quantity.of_sensor for quantity in quantities.values()):
-            self._cloud = server.scene.add_point_cloud(
-                "/surface/cloud",
-                self._local[self._spread],
-                np.full((len(self._spread), 3), NEUTRAL, np.uint8),
-                point_shape="circle",
-                point_size=_POINT_SIZE * spacing_m,
-                visible=False,
-                **POINTS,
-            )
+            points, style = self._local[self._spread], {"point_shape": "circle", "visible": False}
+            size_m = _POINT_SIZE * spacing_m
+            self._cloud = add_cloud(server, "/surface/cloud", points, NEUTRAL, size_m, **style)
 
     def show_scan(self, state: State) -> None:
-        """Show the returns of the scan."""
-        if self._scans is not None and state.scan is not None:
+        if self._scans is not None:
             self._scans.show(state.scan)
 
     def show_cloud(self, state: State) -> None:
@@ -203,23 +194,13 @@ class ScanClouds:
     """The sensor's path, and the returns of one scan, measured in the colours of `scale` and predicted; `text` describes it."""
 
     def __init__(
-        self,
-        server: Any,
-        radar_map: Map,
-        scans: Scans,
-        scale: Scale | None,
-        text: Any,
-        explained: Floats | None,
+        self, server: Any, radar_map: Map, scans: Scans, scale: Scale | None, text: Any, path_color: Any
     ) -> None:
         self._server, self._map, self._scans = server, radar_map, list(scans)
         self._scale, self._text = scale, text
         self._shown: int | None = None
         path = scans.sensor_poses[:, :3, 3] - radar_map.origin
-        color = (
-            SCAN_COLORS["trajectory"] if explained is None else SHARES(explained)[:-1, None].repeat(2, axis=1)
-        )
-        line = add_path(server, "/scans/path", path, color)
-        self.nodes: dict[str, Any] = {"trajectory": line}
+        self.nodes: dict[str, Any] = {"trajectory": add_path(server, "/scans/path", path, path_color)}
         self.show(0)
 
     def sensor(self, index: int) -> Position:
@@ -228,7 +209,6 @@ class ScanClouds:
         return x, y, z
 
     def show(self, index: int) -> None:
-        """Show the returns of a scan."""
         if index == self._shown:
             return
         self._shown = index
@@ -255,8 +235,20 @@ class ScanClouds:
             self.nodes[what].points, self.nodes[what].colors = local, colors
             return
         shape, size_m = _STYLES[what]
-        options = POINTS | {"point_shape": shape, "point_size": size_m}
-        self.nodes[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
+        name = f"/scans/{what}"
+        self.nodes[what] = add_cloud(self._server, name, local, colors, size_m, point_shape=shape)
+
+
+def add_cloud(server: Any, name: str, points: Array, colors: Any, size_m: float, **style: Any) -> Any:
+    """Add a cloud of points (N, 3), m, of one sRGB colour, or of colours (N, 3)."""
+    values = points.astype(np.float32), np.full(points.shape, colors, np.uint8)
+    return server.scene.add_point_cloud(name, *values, point_size=size_m, **_POINTS, **style)
+
+
+def add_mesh(server: Any, mesh: Any, local: Floats, colors: Bytes) -> None:
+    """Add a mesh in sRGB colours (V, 3), shaded by its normals, with its vertices at `local` (V, 3), m."""
+    data = glb(local, mesh.faces, shaded(colors, lightness_of(mesh.vertex_normals)))
+    server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
 
 
 def add_path(server: Any, name: str, path: Array, color: tuple[int, int, int] | Bytes) -> Any:

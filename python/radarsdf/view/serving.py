@@ -17,17 +17,15 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import numpy as np
+from typing_extensions import Self
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import whole_number
 from radarsdf.extras import require
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 LOCALHOST = "127.0.0.1"
 _FIRST_PORT, _PORTS_TRIED = 8080, 100
@@ -133,8 +131,7 @@ def stop_server(server: Any) -> None:
         server.stop()
 
 
-def set_initial_camera(server: Any, pose: "CameraPose") -> None:
-    camera = server.initial_camera
+def aim(camera: Any, pose: "CameraPose") -> None:
     camera.fov = FOV_RAD
     camera.position, camera.look_at = map(tuple, pose)
 
@@ -179,7 +176,7 @@ class Page:
     def stop(self) -> None:
         stop_server(self._server)
 
-    def __enter__(self) -> "Self":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

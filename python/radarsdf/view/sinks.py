@@ -104,10 +104,8 @@ class FoxgloveSink(Sink):
         """Log an array of records (N,), (Y, X) or (Z, Y, X)."""
         of, layout = self._of, cast(Any, cells.dtype.fields)
         kinds = {1: of.PackedElementFieldNumericType.Uint8, 4: of.PackedElementFieldNumericType.Float32}
-        parts = [
-            {"name": name, "offset": at, "type": kinds[kind.itemsize]} for name, (kind, at) in layout.items()
-        ]
-        fields = [of.PackedElementField(**part) for part in parts]
+        parts = ((name, at, kinds[kind.itemsize]) for name, (kind, at) in layout.items())
+        fields = [of.PackedElementField(name=name, offset=at, type=kind) for name, at, kind in parts]
         names = ["slice_stride", "row_stride", "cell_stride"] if cells.ndim > 1 else ["point_stride"]
         values |= dict(zip(names[-cells.ndim :], cells.strides, strict=True))
         self._log(topic, schema, time_s, fields=fields, data=cells.tobytes(), **values)
@@ -150,10 +148,9 @@ class RerunSink(Sink):
         self._log(time_s, {"map/trajectory": line, "map/surface": self._rerun.Mesh3D(**local, **style)})
 
     def show_grid(self, grid: Grid, time_s: float) -> None:
-        style = {"colors": [FREE_COLOR], "radii": 0.2 * grid.voxel_size}
-        self._log(
-            time_s, {"map/free_space": self._rerun.Points3D(self._local(grid.centres(grid.free)), **style)}
-        )
+        free, radius_m = self._local(grid.centres(grid.free)), 0.2 * grid.voxel_size
+        points = self._rerun.Points3D(free, colors=[FREE_COLOR], radii=radius_m)
+        self._log(time_s, {"map/free_space": points})
 
     def _log(self, time_s: float, entities: dict[str, Any]) -> None:
         self._stream.set_time("time", timestamp=time_s)  # of this thread

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
-from radarsdf.checks import check, whole_number
+from radarsdf.checks import check
 from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.mesh import renumbered, with_all
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 Position = tuple[float, float, float]
 
 _SAMPLES = 30_000  # vertices from which the intensity limits are estimated
-_MIN_VERTICES = 1000  # smallest max_vertices: fewer show nothing useful
 # Colours as they are, like those of point clouds and legends.
 _UNLIT = MATT | {"extensions": {"KHR_materials_unlit": {}}}
 _TO_LIGHT = np.array([-0.35, -0.5, 0.79])
@@ -57,7 +56,6 @@ class ShownSurface:
     @classmethod
     def of(cls, radar_map: "Map", voxel_size: float, *, max_vertices: int, **wanted: Any) -> "ShownSurface":
         """Mesh a map, and thin the mesh to `max_vertices`. `wanted`: of `Map.mesh`. Raises a ValueError without a surface."""
-        whole_number(max_vertices, "max_vertices", _MIN_VERTICES)
         mesh: Any = radar_map.mesh(voxel_size, **wanted)
         threshold = Threshold.of_mesh(mesh.metadata)
         mesh, spacing_m = thinned(mesh, max_vertices, voxel_size)
