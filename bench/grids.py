@@ -1,7 +1,7 @@
 """``python -m bench.grids [SCENE ...]``: occupied places that planners' grids report as free, and errors of distances.
 
 A place is a point on a true surface that the radar can detect from one of its poses, in a box of 50 × 50 × 10 m round the
-middle of the path. Distances of free voxels are compared with the true distances from their centres.
+middle of the path. Distances of free voxels are compared with the true distances from their centres, and so are their gradients.
 """
 
 import argparse
@@ -26,6 +26,8 @@ _SENSOR_ABOVE_M = 3.5  # height above the lower face of the box
 _PLACE_M = 0.05  # at most one place per cube of this edge, which makes places uniform over the surface
 _RAYS = 10_000  # rays per batch, from a pose
 _DISTANCES = 20_000
+_NEAR_M = 2.0  # distance of voxels whose gradients count
+_STEP_M, _AXES = 0.05, np.concatenate([np.eye(3), -np.eye(3)])  # for the true gradient, by differences
 _PLACES = 100_000  # largest number per scene
 
 
@@ -75,14 +77,20 @@ def judged(grid: Grid, places: Floats) -> dict[str, float]:
 
 
 def distances(grid: Grid, drive: Simulation, rng: np.random.Generator) -> dict[str, float]:
-    """Errors of the distances of free voxels, m, and the share beyond the stated error, %."""
+    """Errors of the distances of free voxels, m, and of their gradients near surfaces, degrees; shares beyond the stated error, %."""
     field = grid.distances()
     x = grid.centres(grid.free)
     rows = rng.choice(len(x), min(_DISTANCES, len(x)), replace=False)
     true = drive.scene.signed_distance(x[rows])
+    near = x[rows[(true > VOXEL_M) & (true < _NEAR_M)]]
+    ends = drive.scene.signed_distance(np.stack([near + step for step in _STEP_M * _AXES]).reshape(-1, 3))
+    gradient, found = np.subtract(*ends.reshape(2, 3, -1)).T, field.at(near)[1]
+    lengths = np.linalg.norm(gradient, axis=1) * np.linalg.norm(found, axis=1)
+    turned = np.degrees(np.arccos(np.clip((gradient * found).sum(axis=1) / lengths, -1, 1)))
     occupied, not_free = field.occupied_m[grid.free][rows], field.not_free_m[grid.free][rows]
     return {
         "median error, m": round(float(np.median(np.abs(occupied - true))), 3),
+        "median error below 2 m, °": round(float(np.nanmedian(turned)), 1),
         "stated, m": round(field.error_m, 3),
         "beyond it, %": round(100 * float((np.abs(occupied - true) > field.error_m).mean()), 2),
         "too far by it, %": round(100 * float((occupied - true > field.error_m).mean()), 2),
