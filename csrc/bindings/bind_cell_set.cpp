@@ -4,7 +4,7 @@
 #include "bindings/subjects.hpp"
 #include "lattice/cell_set.hpp"
 #include "util/gather_rows.hpp"
-#include "util/stable_order.hpp"
+#include "util/sorting.hpp"
 
 namespace radarsdf {
 namespace {

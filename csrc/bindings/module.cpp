@@ -7,12 +7,11 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_cell_set(m);
   radarsdf::VertexTableClass table = radarsdf::bind_vertex_table(m);
   radarsdf::bind_interpolation(table);
-  radarsdf::bind_optimiser(table);
+  radarsdf::bind_optimisers(m, table);
   radarsdf::bind_ray_average(table);
   radarsdf::bind_encodings(m);
   radarsdf::bind_mlp(m);
   radarsdf::bind_field_loss(m);
-  radarsdf::bind_soap(m);
   radarsdf::bind_surfaces(m, table);
   radarsdf::bind_cell_means(m);
   radarsdf::bind_cell_sums(m);

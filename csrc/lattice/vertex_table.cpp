@@ -11,8 +11,8 @@
 #include "lattice/morton.hpp"
 #include "util/bits.hpp"
 #include "util/parallel.hpp"
-#include "util/parallel_sort.hpp"
 #include "util/prefetch.hpp"
+#include "util/sorting.hpp"
 
 namespace radarsdf {
 namespace {

@@ -10,7 +10,7 @@
 #include "surface/ray_packet.hpp"
 #include "util/integers.hpp"
 #include "util/parallel.hpp"
-#include "util/stable_order.hpp"
+#include "util/sorting.hpp"
 
 namespace radarsdf {
 namespace {

@@ -12,7 +12,7 @@
 #include "util/integers.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
-#include "util/stable_order.hpp"
+#include "util/sorting.hpp"
 
 namespace radarsdf {
 namespace {

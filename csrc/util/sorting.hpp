@@ -7,6 +7,9 @@
 
 namespace radarsdf {
 
+// Sorts in place: blocks in parallel, then pairwise merges.
+void parallel_sort(std::vector<std::uint64_t>& keys, int num_threads);
+
 // Stable argsort of at most 2^31 - 1 keys. A least-significant-digit radix sort: for many millions of keys it takes a
 // quarter of the time of a comparison sort.
 std::vector<std::int32_t> stable_order(const std::uint64_t* keys, std::int64_t count);
