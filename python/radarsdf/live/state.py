@@ -16,7 +16,17 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import FitInput
 from radarsdf.interrupts import at_once
 from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, region_places, regions_of
-from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, rig_of_scans, save_state
+from radarsdf.live.store import (
+    Described,
+    LoggedScan,
+    ScanId,
+    ScanLog,
+    read_regions,
+    rig_of_scans,
+    save_state,
+    unlink_regions,
+    write_regions,
+)
 from radarsdf.live.surface import GrowingSurface
 from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
@@ -61,7 +71,6 @@ class GrowingState:
         self.max_bytes = max_bytes
         self.log = ScanLog(folder, mountings)
         self.track = Track()
-        self._store = RegionStore(folder)
         self._away = NO_KEYS  # ascending keys of the regions on disk
         self._num_threads = resolve_num_threads(config.num_threads)
         self.sums = GrowingSums()
@@ -124,7 +133,7 @@ class GrowingState:
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
-        if self._store.folder is not None:
+        if self.log.folder is not None:
             regions = regions_of(keys << BLOCK_BITS)
             lower = region_places(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
@@ -147,13 +156,13 @@ class GrowingState:
     def _bring_back(self, regions: Keys) -> None:
         regions = np.intersect1d(regions, self._away)
         if len(regions):
-            blocks, columns = self._store.read(regions)
+            blocks, columns = read_regions(self.log.folder, regions)
             away = np.setdiff1d(self._away, regions)
             self._commit(partial(self.sums.insert, *columns), blocks, _away=away)
-            self._store.unlink(regions)
+            unlink_regions(self.log.folder, regions)
 
     def _put_away(self, regions: Keys) -> Keys:
-        blocks, written = self._store.write(self.sums, regions)
+        blocks, written = write_regions(self.log.folder, self.sums, regions)
         away = np.union1d(self._away, written)
         return self._commit(partial(self.sums.erase, blocks), blocks, _away=away)
 

@@ -3,7 +3,7 @@
 import itertools
 import sqlite3
 import weakref
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -116,12 +116,7 @@ class _Rows:
     """Rows of scans in a file, which never change: a change of the map adds others, so that it can be undone."""
 
     def __init__(self, folder: Path | None) -> None:
-        self.folder = folder
-
-    @property
-    def _path(self) -> Path:
-        assert self.folder is not None
-        return self.folder / _SCANS
+        self._path = (folder or Path()) / _SCANS  # without a folder, nothing is read or written
 
     @cached_property
     def _opened(self) -> sqlite3.Connection:
@@ -250,26 +245,26 @@ class ScanLog:
         self._scans[scan_id] = scan
         self.num_bytes += scan.num_bytes - (0 if before is None else before.num_bytes)
 
-    def exchanged(
-        self, new: Mapping[ScanId, LoggedScan], old: Iterable[ScanId], sealed: Iterable[ScanId] = ()
-    ) -> "ScanLog":
+    def exchanged(self, new: Mapping[ScanId, LoggedScan], old: Collection[ScanId]) -> "ScanLog":
         """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
-        old, sealed = set(old), set(sealed)
-        log = copy(self)
-        log._scans = self._scans.copy()
-        log.edits += bool(old)
-        if sealed:
-            log.sealed = self.sealed | sealed
         stored = {scan_id: row for scan_id in old if (row := self._row(scan_id)) is not None}
+        log = self._without(set(old) - new.keys() - stored.keys())
+        log.edits += bool(old)
         log._gone = self._gone.union(number for number, *_ in stored.values())
         log._stored -= len(stored)
-        for scan_id in (old | sealed) - new.keys() - stored.keys():
-            log.num_bytes -= log._scans.pop(scan_id).num_bytes
         log._write(
             [(place, scan_id, new[scan_id]) for scan_id, (_, place, *_) in stored.items() if scan_id in new]
         )
         for scan_id in new.keys() - stored.keys():
             log.put(scan_id, new[scan_id])
+        return log
+
+    def _without(self, held: Iterable[ScanId], *, sealed: bool = False) -> "ScanLog":
+        """Return a log without the scans `held` in memory. `sealed`: these stay in the map."""
+        log, gone = copy(self), set(held)
+        log._scans = {scan_id: scan for scan_id, scan in self._scans.items() if scan_id not in gone}
+        log.num_bytes -= sum(self._scans[scan_id].num_bytes for scan_id in gone)
+        log.sealed = self.sealed | gone if sealed else self.sealed
         return log
 
     def _write(self, scans: Sequence[tuple[int, ScanId, LoggedScan]]) -> None:
@@ -301,13 +296,9 @@ class ScanLog:
                 break
             excess -= scan.num_bytes
             oldest.append(scan_id)
-        if self.folder is None:
-            return self.exchanged({}, (), oldest)
-        log = copy(self)
-        log._write([(self._end + i, scan_id, self._scans[scan_id]) for i, scan_id in enumerate(oldest)])
-        log._scans = self._scans.copy()
-        for scan_id in oldest:
-            log.num_bytes -= log._scans.pop(scan_id).num_bytes
+        log = self._without(oldest, sealed=self.folder is None)
+        if self.folder is not None:
+            log._write([(self._end + i, scan_id, self._scans[scan_id]) for i, scan_id in enumerate(oldest)])
         return log
 
     def sealed_beyond(self, centre: Floats, radius_m: float) -> "ScanLog":
@@ -317,48 +308,43 @@ class ScanLog:
             reach_m = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1).max())
             if np.linalg.norm(scan.pose[:3, 3] - centre) + reach_m > radius_m:
                 sealed.append(scan_id)
-        return self.exchanged({}, (), sealed)
+        return self._without(sealed, sealed=True)
 
 
 def _pose_of(blob: bytes) -> Floats:
     return np.frombuffer(blob).reshape(4, 4).copy()
 
 
-class RegionStore:
-    """Region store: sums of regions on disk, one file each in `folder`, restored bit-identically."""
+def _region_paths(folder: Path | None, regions: Keys) -> list[Path]:
+    """Return the files of regions (R,), which hold their sums bit-identically."""
+    return [(folder or Path()) / f"region-{region:016x}.npz" for region in regions.tolist()]
 
-    def __init__(self, folder: Path | None) -> None:
-        self.folder = folder
 
-    def _path(self, region: int) -> Path:
-        assert self.folder is not None
-        return self.folder / f"region-{region:016x}.npz"
+def write_regions(folder: Path | None, sums: GrowingSums, regions: Keys) -> tuple[Keys, Keys]:
+    """Write those of `regions` that are in `sums`. Return the ascending keys of their blocks, and theirs."""
+    blocks = sums.block_keys()
+    region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
+    written = np.intersect1d(regions, region_of_block)
+    for region, path in zip(written, _region_paths(folder, written), strict=True):
+        _save(path, **arrays_of_sums(sums, blocks[region_of_block == region]))
+    return blocks[np.isin(region_of_block, written)], written
 
-    def write(self, sums: GrowingSums, regions: Keys) -> tuple[Keys, Keys]:
-        """Write those of `regions` that are in `sums`. Return the ascending keys of their blocks, and theirs."""
-        blocks = sums.block_keys()
-        region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
-        written = np.intersect1d(regions, region_of_block)
-        for region in written.tolist():
-            own = blocks[region_of_block == region]
-            _save(self._path(region), **arrays_of_sums(sums, own))
-        return blocks[np.isin(region_of_block, written)], written
 
-    def read(self, regions: Keys) -> tuple[Keys, list[Array]]:
-        """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums."""
-        read = []
-        for path in map(self._path, regions.tolist()):
-            with reading(path, "a whole region of a live map"):
-                read.append(_sums_of(arrays_of(path, _CELL_COLUMNS)))
-        columns = [np.concatenate(parts) for parts in zip(*read, strict=True)]
-        keys, _, _, visibility_keys, _ = columns
-        return np.union1d(visibility_keys, keys >> BLOCK_BITS), columns
+def read_regions(folder: Path | None, regions: Keys) -> tuple[Keys, list[Array]]:
+    """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums."""
+    read = []
+    for path in _region_paths(folder, regions):
+        with reading(path, "a whole region of a live map"):
+            read.append(_sums_of(arrays_of(path, _CELL_COLUMNS)))
+    columns = [np.concatenate(parts) for parts in zip(*read, strict=True)]
+    keys, _, _, visibility_keys, _ = columns
+    return np.union1d(visibility_keys, keys >> BLOCK_BITS), columns
 
-    def unlink(self, regions: Keys) -> None:
-        """Delete the files of regions that are in memory again."""
-        for region in regions.tolist():
-            with suppress(OSError):  # a leftover file is harmless
-                self._path(region).unlink()
+
+def unlink_regions(folder: Path | None, regions: Keys) -> None:
+    for path in _region_paths(folder, regions):
+        with suppress(OSError):  # a leftover file is harmless
+            path.unlink()
 
 
 def arrays_of_sums(sums: GrowingSums, blocks: Keys) -> dict[str, Array]:

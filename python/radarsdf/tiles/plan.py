@@ -230,15 +230,14 @@ class Plan:
                 config=FitConfig.from_dict(described.pop("config")),
                 sensor=Sensor.from_dict(described.pop("sensor")),
                 tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
-                radars=tuple(_radar_of(radar) for radar in described.pop("radars")),
+                radars=tuple(
+                    RadarPlan(**radar | {"sensor": Sensor.from_dict(radar["sensor"])})
+                    for radar in described.pop("radars")
+                ),
                 **described,
             )
             check(plan._file_bytes() == content, "its checksum is wrong")
             return plan
-
-
-def _radar_of(described: dict[str, Any]) -> RadarPlan:
-    return RadarPlan(**described | {"sensor": Sensor.from_dict(described["sensor"])})
 
 
 def folder_of(folder: Path, tile: Tile) -> Path:
