@@ -309,9 +309,9 @@ class LiveMap:
             alike = state.with_intensities in (None, with_intensities)
             check(alike, "either all scans have intensities, or none has")
             steps = [] if given is not None else self._follower.seek(state.track, state.log, scan_id, scan)
-            come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
+            come = {step.scan_id: dataclasses.replace(step.logged, pose=step.found.pose) for step in steps}
             if given is not None:
-                come[scan_id] = scan.at(given)
+                come[scan_id] = dataclasses.replace(scan, pose=given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
             lattice, origin = self.config.lattice, state.origin
             if origin is None:
@@ -357,7 +357,7 @@ class LiveMap:
                 pose = check_pose(given, f"the pose of scan {scan_id!r:.50}")
                 scan = self._state.log.get(scan_id)
                 if (pose != scan.pose).any():
-                    moved[scan_id] = scan.at(pose.copy())
+                    moved[scan_id] = dataclasses.replace(scan, pose=pose.copy())
             return self._state.exchange(moved, moved)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:

@@ -91,9 +91,6 @@ class LoggedScan:
     def num_bytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
 
-    def at(self, pose: Floats) -> "LoggedScan":
-        return replace(self, pose=pose)
-
 
 def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
     known = [scan.radar for scan in scans if scan.radar is not None]
@@ -210,10 +207,16 @@ class ScanLog:
             return _pose_of(row[2]), row[3]
         return None if held is None else (held.pose, held.time_s)
 
-    def _find(self, scan_id: ScanId) -> LoggedScan | None:
+    def get(self, scan_id: ScanId) -> LoggedScan:
+        """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
+        sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
+        check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
         row = self._row(scan_id)
         if row is None:
-            return self._scans.get(scan_id)
+            if scan_id not in self._scans:
+                msg = f"the map has no scan {scan_id!r}"
+                raise KeyError(msg)
+            return self._scans[scan_id]
         number, _, pose, time_s = row
         columns = f"radar, {', '.join(_KINDS)} FROM scans WHERE number = ?"
         ((radar, *blobs),) = self._rows.read(columns, number)
@@ -224,16 +227,6 @@ class ScanLog:
         held["points"] = held["points"].reshape(-1, 3)
         mounted = None if radar is None else self._radars[radar]
         return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted)
-
-    def get(self, scan_id: ScanId) -> LoggedScan:
-        """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
-        sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
-        check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
-        found = self._find(scan_id)
-        if found is None:
-            msg = f"the map has no scan {scan_id!r}"
-            raise KeyError(msg)
-        return found
 
     def scans(self, every: int = 1) -> Iterator[LoggedScan]:
         """Iterate over every n-th scan that can be removed, in order."""
