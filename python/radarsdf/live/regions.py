@@ -64,7 +64,7 @@ class RegionTable:
 
     def __init__(self, leaves_per_cell: int = 1, **columns: Array) -> None:
         """Create an empty table. `columns`: default row of each column."""
-        self._merged = leaves_per_cell.bit_length() - 1
+        self._leaves_per_cell = leaves_per_cell
         self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}
         self.num_bytes = 0
@@ -97,10 +97,5 @@ class RegionTable:
                 self.num_bytes += sum(column.nbytes for column in part.values())
 
     def regions_of(self, keys: Keys) -> Keys:
-        """Return the regions (N,) of this table's cells with ascending `keys` (N,)."""
-        if self._merged == 0:
-            return keys >> REGION_BITS
-        bits = REGION_BITS - np.uint64(3 * self._merged)
-        regions, rows = np.unique(keys >> bits, return_inverse=True)
-        places = lattice_of(regions << bits) // (REGION_CELLS >> self._merged)
-        return (_keys_at(REGION_CELLS * places) >> REGION_BITS)[rows]
+        """Return the regions (N,) of this table's cells with `keys` (N,)."""
+        return _keys_at(self._leaves_per_cell * lattice_of(keys)) >> REGION_BITS
