@@ -15,7 +15,6 @@ from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import FitInput
 from radarsdf.interrupts import at_once
-from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, region_places, regions_of
 from radarsdf.live.store import (
     Described,
     LoggedScan,
@@ -27,7 +26,7 @@ from radarsdf.live.store import (
     unlink_regions,
     write_regions,
 )
-from radarsdf.live.surface import GrowingSurface
+from radarsdf.live.surface import NO_KEYS, REGION_BITS, REGION_CELLS, GrowingSurface, regions_of
 from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale
@@ -135,7 +134,7 @@ class GrowingState:
             return keys
         if self.log.folder is not None:
             regions = regions_of(keys << BLOCK_BITS)
-            lower = region_places(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
+            lower = lattice_of(regions << REGION_BITS) * self.config.leaf_size_m + self.origin
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
             return self._put_away(regions[np.square(nearest - centre).sum(axis=1) > radius_m**2])
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
@@ -215,8 +214,7 @@ class GrowingState:
         self.sums.insert(*sums)
         self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
         self.next_id, self.with_intensities = described.next_id, described.with_intensities
-        for scan_id, scan in zip(described.ids, scans, strict=True):
-            self.log.put(scan_id, scan)
+        self.log = self.log.exchanged(dict(zip(described.ids, scans, strict=True)), ())
         self.log.sealed |= set(described.sealed)
         self._bound()
 

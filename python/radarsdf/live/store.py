@@ -19,7 +19,7 @@ from radarsdf.arrays import Array, Bools, Floats, Floats32, Keys
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, check_values_of_scan, positions
 from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
-from radarsdf.live.regions import REGION_BITS
+from radarsdf.live.surface import REGION_BITS
 from radarsdf.returns.evidence import BLOCK_BITS
 from radarsdf.rig import Label, Mounted, Rig, checked_mountings
 
@@ -232,12 +232,6 @@ class ScanLog:
         """Iterate over every n-th scan that can be removed, in order."""
         return (self.get(scan_id) for scan_id in self.ids[::every])
 
-    def put(self, scan_id: ScanId, scan: LoggedScan) -> None:
-        """Add a scan, or replace it in place."""
-        before = self._scans.get(scan_id)
-        self._scans[scan_id] = scan
-        self.num_bytes += scan.num_bytes - (0 if before is None else before.num_bytes)
-
     def exchanged(self, new: Mapping[ScanId, LoggedScan], old: Collection[ScanId]) -> "ScanLog":
         """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
         stored = {scan_id: row for scan_id in old if (row := self._row(scan_id)) is not None}
@@ -248,8 +242,10 @@ class ScanLog:
         log._write(
             [(place, scan_id, new[scan_id]) for scan_id, (_, place, *_) in stored.items() if scan_id in new]
         )
-        for scan_id in new.keys() - stored.keys():
-            log.put(scan_id, new[scan_id])
+        held = {scan_id: scan for scan_id, scan in new.items() if scan_id not in stored}
+        log.num_bytes += sum(scan.num_bytes for scan in held.values())
+        log.num_bytes -= sum(log._scans[scan_id].num_bytes for scan_id in held.keys() & log._scans.keys())
+        log._scans |= held  # in place of those with the same ids
         return log
 
     def _without(self, held: Iterable[ScanId], *, sealed: bool = False) -> "ScanLog":

@@ -256,10 +256,6 @@ class _Planner:
             in_cells += float(surfels.counts[held].sum())
             cells += len(held)
         noise = SensorNoise.median(noises)
-        of_cells: dict[str, Any] = {
-            "clutter_ratio": clutter / returns,
-            "returns_per_cell": in_cells / max(cells, 1),
-        }
         radars, of_radar = [], map(SensorNoise.median, zip(*of_radars, strict=True))
         same_unit = _median_units(units)
         for radar, own, unit in zip(plan.radars, of_radar, same_unit, strict=True):
@@ -274,7 +270,8 @@ class _Planner:
             sensor=dataclasses.replace(sensor, noise=noise),
             radars=tuple(radars),
             tiles=tuple(sorted(tiles, key=lambda tile: tile.tile)),
-            **of_cells,
+            clutter_ratio=clutter / returns,
+            returns_per_cell=in_cells / max(cells, 1),
         )
 
     def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
