@@ -17,6 +17,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, GridField
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.io.files import check_regular_file, reading, write_whole
+from radarsdf.io.npz import check_arrays
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.queries import MapContents
 from radarsdf.returns.evidence import Evidence
@@ -29,19 +30,18 @@ from radarsdf.settings import by_name, first_wrong
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 14
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
-# Types of the columns of `Evidence`.
-_EVIDENCE = {"information": torch.float32, "hits": torch.uint32, "visibility": torch.uint32}
-# Types and dimensions of the arrays of other parts. Bits and keys are stored as int64, which all readers of safetensors
-# support; keys have at most 63 bits, like those of leaf cells.
-_PARTS = {
-    "free_space": {"keys": (torch.int64, 1), "planes": (torch.int64, 3)},
+_EVIDENCE = {"information": np.float32, "hits": np.uint32, "visibility": np.uint32}  # types of its columns
+# Types and shapes of the arrays of other parts. Bits and keys are stored as int64, which all readers of safetensors support;
+# keys have at most 63 bits, like those of leaf cells.
+_PARTS: dict[str, dict[str, tuple[Any, ...]]] = {
+    "free_space": {"keys": (np.int64, None), "planes": (np.int64, None, None, None)},
     "view_statistics": {
-        "points": (torch.float32, 2), "directions": (torch.int8, 2), "ranges_m": (torch.float16, 1),
-        "intensities": (torch.float32, 1), "counts": (torch.int16, 1),
+        "points": (np.float32, None, None), "directions": (np.int8, None, None), "ranges_m": (np.float16, None),
+        "intensities": (np.float32, None), "counts": (np.int16, None),
     },
     "reflectance": {
-        "coefficients": (torch.float64, 2), "table": (torch.float32, 2), "plane_keys": (torch.int64, 1),
-        "normals": (torch.float32, 2), "mean_keys": (torch.int64, 1), "means": (torch.float16, 1),
+        "coefficients": (np.float64, None, None), "table": (np.float32, None, None), "plane_keys": (np.int64, None),
+        "normals": (np.float32, None, None), "mean_keys": (np.int64, None), "means": (np.float16, None),
     },
 }  # fmt: skip
 
@@ -117,28 +117,28 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
     """Invert :func:`parts_of`. Raise an exception of any type if parts are inconsistent."""
     config = FitConfig.from_dict(description["config"])
-    origin = _taken(tensors, "origin", torch.float64, (3,))
-    keys = _taken(tensors, "leaf_keys", torch.int64, (None,))
-    evidence = {name: _taken(tensors, name, dtype, keys.shape) for name, dtype in _EVIDENCE.items()}
+    origin, keys = _taken(tensors, {"origin": (np.float64, 3), "leaf_keys": (np.int64, None)}).values()
+    evidence = _taken(tensors, {name: (dtype, len(keys)) for name, dtype in _EVIDENCE.items()})
     check((evidence["information"] >= 0).all(), "information is negative")
-    free_space = FreeSpace(**_arrays_of("free_space", tensors))
+    free_space = FreeSpace(**_taken(tensors, _PARTS["free_space"], "free_space."))
     free_space.check()
     sigma = float(description["view_sigma"])
-    view_statistics = ViewStatistics(**_arrays_of("view_statistics", tensors), sigma=sigma)
+    views = _taken(tensors, _PARTS["view_statistics"], "view_statistics.")
+    view_statistics = ViewStatistics(**views, sigma=sigma)
     view_statistics.check(config.leaf_size_m)
     limits = description["intensity_scale"]
     scale = None if limits is None else IntensityScale.between(limits)
     share, reflectance = description["network_share"], None
     if share is not None:
         share = _in_range("network_share", share, 1)
-        arrays = _arrays_of("reflectance", tensors)
+        arrays = _taken(tensors, _PARTS["reflectance"], "reflectance.")
         reflectance = Reflectance(config.leaf_size_m, **arrays, network_share=share)
         reflectance.check()
     # A map with intensities needs a network or a closed form to predict them; one without has neither.
     trained = scale is not None and config.trains_intensity
     answered = trained or reflectance is not None
     check(answered == (scale is not None), "a predictor of intensities is missing or superfluous")
-    field = _field_of(tensors, keys.astype(np.uint64), config, trained)
+    field = _field_of(tensors, keys, config, trained)
     field.reflectance = reflectance
     return MapContents(
         field=field,
@@ -172,21 +172,17 @@ def _field_of(tensors: dict[str, Tensor], keys: Keys, config: FitConfig, with_in
     return field
 
 
-def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    arrays = {}
-    for name, (dtype, dimensions) in _PARTS[part].items():
-        array = _taken(tensors, f"{part}.{name}", dtype, (None,) * dimensions)
-        arrays[name] = array.view(np.uint64) if dtype == torch.int64 else array
-    return arrays
-
-
-def _taken(tensors: dict[str, Tensor], name: str, dtype: torch.dtype, shape: tuple[int | None, ...]) -> Array:
-    """Pop a tensor of finite numbers of this type and shape; None stands for any length."""
-    tensor = tensors.pop(name)
-    fits = tensor.dtype == dtype and tensor.ndim == len(shape) and bool(tensor.isfinite().all())
-    fits &= all(wanted in (None, length) for wanted, length in zip(shape, tensor.shape, strict=False))
-    check(fits, f"{name} is not {shape} finite numbers, {dtype}")
-    return tensor.numpy().copy()
+def _taken(
+    tensors: dict[str, Tensor], wanted: dict[str, tuple[Any, ...]], prefix: str = ""
+) -> dict[str, Any]:
+    """Pop arrays of finite numbers, by type and shape as for :func:`check_arrays`, with int64 as uint64."""
+    arrays = {name: tensors.pop(f"{prefix}{name}").numpy().copy() for name in wanted}
+    check_arrays(arrays, wanted)
+    for name, array in arrays.items():
+        check(np.isfinite(array).all(), f"{name} contains non-finite numbers")
+    return {
+        name: array.view(np.uint64) if array.dtype == np.int64 else array for name, array in arrays.items()
+    }
 
 
 def _in_range(name: str, value: Any, highest: float) -> float:
