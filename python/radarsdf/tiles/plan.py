@@ -20,7 +20,7 @@ from radarsdf.checks import MAX_POSITION_M, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors
-from radarsdf.map.storage import checked_report
+from radarsdf.map.radar_map import checked_report
 from radarsdf.returns.noise import RigNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Radars, Sensor, in_map_unit
