@@ -404,9 +404,8 @@ class LiveMap:
             If it cannot be read, or another map uses `folder`.
         """
         described, scans, sums = load_state(path)
-        config = FitConfig.from_dict(described.config)
         live = cls(
-            config,
+            FitConfig.from_dict(described.config),
             origin=described.origin,
             max_bytes=described.max_bytes,
             folder=folder,

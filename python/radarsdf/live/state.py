@@ -15,17 +15,8 @@ from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import FitInput
 from radarsdf.interrupts import at_once
-from radarsdf.live.store import (
-    Described,
-    LoggedScan,
-    ScanId,
-    ScanLog,
-    read_regions,
-    rig_of_scans,
-    save_state,
-    unlink_regions,
-    write_regions,
-)
+from radarsdf.live import store
+from radarsdf.live.store import Described, LoggedScan, ScanId, ScanLog, rig_of_scans
 from radarsdf.live.surface import NO_KEYS, REGION_BITS, REGION_CELLS, GrowingSurface, regions_of
 from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
@@ -155,13 +146,13 @@ class GrowingState:
     def _bring_back(self, regions: Keys) -> None:
         regions = np.intersect1d(regions, self._away)
         if len(regions):
-            blocks, columns = read_regions(self.log.folder, regions)
+            blocks, columns = store.read_regions(self.log.folder, regions)
             away = np.setdiff1d(self._away, regions)
             self._commit(partial(self.sums.insert, *columns), blocks, _away=away)
-            unlink_regions(self.log.folder, regions)
+            store.unlink_regions(self.log.folder, regions)
 
     def _put_away(self, regions: Keys) -> Keys:
-        blocks, written = write_regions(self.log.folder, self.sums, regions)
+        blocks, written = store.write_regions(self.log.folder, self.sums, regions)
         away = np.union1d(self._away, written)
         return self._commit(partial(self.sums.erase, blocks), blocks, _away=away)
 
@@ -207,7 +198,7 @@ class GrowingState:
             mountings=mountings,
             radars=[] if self.mountings is None else [[*self.mountings].index(scan.label) for scan in scans],
         )
-        save_state(path, described, scans, self.sums)
+        store.save_state(path, described, scans, self.sums)
 
     def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[Array]) -> None:
         """Restore a saved state into a new one."""

@@ -1,6 +1,5 @@
 """Surface of a live map: a quick fit of the sums, updated incrementally by regions of 64³ leaf cells."""
 
-import itertools
 import math
 
 import numpy as np
@@ -37,7 +36,7 @@ _BLOCK_CELLS, _LARGE_CELLS = 8, 16  # edges of cubes that quantise distances fro
 
 def steps_near(reach: int) -> Ints:
     """Return all offsets ((2 reach + 1)³, 3) of at most `reach` along each axis."""
-    return np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
+    return np.array(list(np.ndindex(*(2 * reach + 1,) * 3)), np.int64) - reach
 
 
 def shifted(keys: Keys, steps: Ints) -> Keys:
