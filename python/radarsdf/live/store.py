@@ -97,18 +97,6 @@ def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
     return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
 
-def _scan_of(
-    arrays: Mapping[str, Array], pose: Floats, time_s: float | None, radar: Mounted | None
-) -> LoggedScan:
-    """Build a scan from the arrays of its file. Raise a KeyError or a ValueError if it is damaged."""
-    points = positions(arrays["points"], "points")
-    for name, array in arrays.items():
-        if name != "points":
-            check_values_of_scan(array, points, name, 0)
-        check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
-    return LoggedScan(pose, **arrays, time_s=time_s, radar=radar)
-
-
 class _Rows:
     """Rows of scans in a file, which never change: a change of the map adds others, so that it can be undone."""
 
@@ -401,6 +389,12 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
         scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
         numbers = described.radars if radars else [0] * len(names)
         for of_scan, pose, time_s, k in zip(names, described.poses, described.times_s, numbers, strict=True):
-            held = {name: arrays[key] for key, name in of_scan.items() if key in arrays}
-            scans.append(_scan_of(held, check_pose(pose, "pose"), time_s, radars[k] if radars else None))
+            held: dict[str, Any] = {name: arrays[key] for key, name in of_scan.items() if key in arrays}
+            points = positions(held["points"], "points")
+            for name, array in held.items():
+                if name != "points":
+                    check_values_of_scan(array, points, name, 0)
+                check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
+            mounted = radars[k] if radars else None
+            scans.append(LoggedScan(check_pose(pose, "pose"), **held, time_s=time_s, radar=mounted))
         return described, scans, _sums_of(arrays)

@@ -276,14 +276,11 @@ class _Planner:
 
     def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
         """Estimate a sensor without noise from the samples of radars, with the intensities in one unit."""
-        points, values = [], []
-        for own, unit in radars:
-            for _, scan in own.samples:
-                points.append(scan.points)
-                if scan.intensities is not None:
-                    values.append(in_map_unit(np.asarray(scan.intensities), unit))
+        scans = [(scan, unit) for own, unit in radars for _, scan in own.samples]
+        measured = [(np.asarray(s.intensities), unit) for s, unit in scans if s.intensities is not None]
+        values = [in_map_unit(*own) for own in measured]
         limits = {name: getattr(self._config.returns, name) for name in ("min_range_m", "max_range_m")}
-        return Sensor.of(points, values or None, **limits)
+        return Sensor.of([scan.points for scan, _ in scans], values or None, **limits)
 
 
 def _median_units(of_tiles: list[tuple[Unit | None, ...]]) -> list[Unit]:
