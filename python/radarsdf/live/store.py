@@ -239,8 +239,9 @@ class ScanLog:
     def _without(self, held: Iterable[ScanId], *, sealed: bool = False) -> "ScanLog":
         """Return a log without the scans `held` in memory. `sealed`: these stay in the map."""
         log, gone = copy(self), set(held)
-        log._scans = {scan_id: scan for scan_id, scan in self._scans.items() if scan_id not in gone}
-        log.num_bytes -= sum(self._scans[scan_id].num_bytes for scan_id in gone)
+        log._scans = self._scans.copy()
+        for scan_id in gone:
+            log.num_bytes -= log._scans.pop(scan_id).num_bytes
         log.sealed = self.sealed | gone if sealed else self.sealed
         return log
 
