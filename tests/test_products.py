@@ -22,7 +22,7 @@ ALLOWED = {"returns/noise.py: lstsq"}
 FIT = """
 import hashlib, sys
 import numpy as np, radarsdf
-from radarsdf.map import storage
+from radarsdf.map.radar_map import parts_of
 from tests.conftest import ground_and_wall
 
 scene = ground_and_wall(scans=2, returns_per_scan=40_000)
@@ -30,7 +30,7 @@ sensor_mps = np.array([1.0, 0.0, 0.0])
 doppler = [-scan @ sensor_mps / np.linalg.norm(scan, axis=1) for scan in scene.points]
 for config in (radarsdf.FitConfig.quick(), radarsdf.FitConfig(effort=0.02)):
     found = radarsdf.fit(scene.points, scene.poses, scene.intensities, doppler_mps=doppler, config=config)
-    tensors, _ = storage.parts_of(found._contents)
+    tensors, _ = parts_of(found._contents)
     at = scene.points[0][:20_000] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
     answers = {"confidence": found.confidence(at), "sdf": found.sdf(at), "uncertainty": found.uncertainty(at)}
     for name, numbers in (tensors | answers).items():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.map.storage import parts_of
+from radarsdf.map.radar_map import parts_of
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import prepare
 from radarsdf.tiles.plan import Plan

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
-from radarsdf.live.regions import regions_of
+from radarsdf.live.surface import regions_of
 
 from bench.live.removal import state
 

@@ -11,7 +11,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig
 from radarsdf.io.tensors import open_tensors, tensor_bytes
-from radarsdf.map.storage import load_leaf_keys
+from radarsdf.map.radar_map import load_leaf_keys
 from safetensors.torch import save_file
 
 from ..settings import grouped

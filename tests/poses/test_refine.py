@@ -8,7 +8,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.map.storage import checked_report
+from radarsdf.map.radar_map import checked_report
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.odometry import PosedScans

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.map import storage
+from radarsdf.map.radar_map import parts_of
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
@@ -69,7 +69,7 @@ def test_radars_of_equal_noise_are_one_radar_to_the_bit():
     scans, config = rig(), QUICK.override(returns=known)
     of_rig = radarsdf.fit(Scans(scans.points, scans.poses, sensors=scans.sensors), config=config)
     of_one = radarsdf.fit(scans.points, scans.poses, config=config)
-    tensors, expected = (storage.parts_of(m.contents_of_any)[0] for m in (of_rig, of_one))
+    tensors, expected = (parts_of(m.contents_of_any)[0] for m in (of_rig, of_one))
     assert all((tensors[name] == expected[name]).all() for name in expected)
 
 
@@ -119,7 +119,7 @@ def test_a_map_answers_for_each_radar(rig_map, tmp_path):
 
 
 def test_files_of_one_radar_do_not_mention_units(radar_map):
-    description = storage.parts_of(radar_map.contents_of_any)[1]
+    description = parts_of(radar_map.contents_of_any)[1]
     assert "sensors" not in description
     assert "unit" not in description["sensor"]
     assert radar_map.sensors == {}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from radarsdf.map import storage
+from radarsdf.map.radar_map import load_contents, parts_of
 from radarsdf.tiles.plan import Plan, map_path
 
 _WORKERS = 1
@@ -75,6 +75,6 @@ def bits_of(folder: Path) -> dict[str, bytes]:
     """All numbers of all maps."""
     found: dict[str, bytes] = {}
     for tile in Plan.load(folder).tiles:
-        tensors, _ = storage.parts_of(storage.load_contents(map_path(folder, tile)))
+        tensors, _ = parts_of(load_contents(map_path(folder, tile)))
         found |= {f"{tile.name}.{name}": np.asarray(tensor).tobytes() for name, tensor in tensors.items()}
     return found

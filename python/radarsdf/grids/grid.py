@@ -16,6 +16,7 @@ from radarsdf.checks import check, number, path_of, real_array
 from radarsdf.grids.files import write_map_server, write_octomap, write_vdb
 from radarsdf.io.files import checked_suffix
 from radarsdf.io.npz import write_arrays
+from radarsdf.map.map import as_positions
 from radarsdf.settings import settings
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 1
@@ -111,7 +112,7 @@ class DistanceField:
         """
         values, known = self._padded
         i, j, k = (n // values.itemsize for n in values.strides)
-        place = (_checked_positions(x).T.copy() - self.origin[:, None]) / self.voxel_size + 0.5
+        place = (as_positions(x)[0].T.copy() - self.origin[:, None]) / self.voxel_size + 0.5
         # Positions outside, and NaN, are moved into the padding, which is unknown.
         place = np.fmax(np.fmin(place, np.array(self.known.shape)[:, None] + 0.999), 0)
         voxels = place.astype(np.int64)
@@ -197,7 +198,7 @@ class Grid:
 
         It is unknown outside the grid, and at non-finite positions. Raises a ValueError for another shape.
         """
-        positions = _checked_positions(x)
+        positions, _ = as_positions(x)
         voxels = np.nan_to_num(np.floor((positions - self.origin) / self.voxel_size), nan=-1)
         inside = ((voxels >= 0) & (voxels < self.shape)).all(axis=1)
         found = np.full(len(positions), UNKNOWN, np.int8)
@@ -386,14 +387,6 @@ def _planes(height: Floats32, size: float) -> tuple[Floats32, Floats32]:
     step = np.fmax.reduce(np.abs(around - np.einsum("ka,xya->xyk", design, plane)), axis=-1)
     slope = np.arctan(np.hypot(plane[..., 1], plane[..., 2]))
     return slope.astype(np.float32), step.astype(np.float32)
-
-
-def _checked_positions(x: ArrayLike) -> Floats:
-    """Convert to positions (N, 3) float64. Raises a ValueError for another shape."""
-    positions: Floats = real_array(x, "positions")
-    rows = positions.ndim == 2 and positions.shape[1] == 3
-    check(rows, f"positions must have shape (N, 3), not {positions.shape}")
-    return positions
 
 
 def _checked_obstacles(obstacles: ArrayLike | None) -> Floats:

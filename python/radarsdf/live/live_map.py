@@ -203,7 +203,7 @@ class LiveMap:
         """Return the times (F,), s, NaN where unknown, and the poses (F, 4, 4) of the scans of :attr:`scan_ids`."""
         with self._owned(changes=False):
             known = self._state.log.trajectory()
-        times_s = np.array([np.nan if time_s is None else time_s for *_, time_s in known])
+        times_s = np.array([time_s for *_, time_s in known], np.float64)  # NaN for None
         return times_s, np.array([pose for _, pose, _ in known]).reshape(-1, 4, 4)
 
     def integrate(
@@ -263,13 +263,9 @@ class LiveMap:
         given = None if pose is None else check_pose(pose, "pose").copy()
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         if self._state.log.folder is not None:
-            storable = (
-                scan_id is None or type(scan_id) is str or (type(scan_id) is int and abs(scan_id) < 2**63)
-            )
-            check(
-                storable,
-                f"with a folder, scan_id must be a string or an integer of 64 bits, not {scan_id!r:.50}",
-            )
+            storable = type(scan_id) in (type(None), str) or (type(scan_id) is int and abs(scan_id) < 2**63)
+            wanted = "with a folder, scan_id must be a string or an integer of 64 bits"
+            check(storable, f"{wanted}, not {scan_id!r:.50}")
         check(given is not None or scan.time_s is not None, "a scan needs a pose, or a time")
         try:
             found = self._integrate(scan, given, scan_id, far)
@@ -289,16 +285,8 @@ class LiveMap:
         scans = [scan for _, scan in self._unplaced]
         if self._lost % SUBMAP_SCANS or len(self) == 0:
             raise lost
-        labels, number = [scan.label for scan in scans], self._state.number
-        speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
-        drive = Scans(
-            [scan.points for scan in scans],
-            np.full((len(scans), 4, 4), np.nan),
-            doppler_mps=speeds if len(speeds) == len(scans) else None,
-            times_s=np.array([scan.time_s for scan in scans]),
-            sensors=None if self._state.mountings is None else labels,
-            T_body_sensor=self._state.mountings,
-        )
+        number, times_s = self._state.number, np.array([scan.time_s for scan in scans])
+        drive = self._drive(scans, np.full((len(scans), 4, 4), np.nan), times_s=times_s)
         try:
             if self._index is None or self._index[0] != number:
                 self._index = number, SurfaceIndex.of_mesh(self.mesh(), self.config.leaf_size_m)
@@ -321,9 +309,9 @@ class LiveMap:
             alike = state.with_intensities in (None, with_intensities)
             check(alike, "either all scans have intensities, or none has")
             steps = [] if given is not None else self._follower.seek(state.track, state.log, scan_id, scan)
-            come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
+            come = {step.scan_id: dataclasses.replace(step.logged, pose=step.found.pose) for step in steps}
             if given is not None:
-                come[scan_id] = scan.at(given)
+                come[scan_id] = dataclasses.replace(scan, pose=given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
             lattice, origin = self.config.lattice, state.origin
             if origin is None:
@@ -369,7 +357,7 @@ class LiveMap:
                 pose = check_pose(given, f"the pose of scan {scan_id!r:.50}")
                 scan = self._state.log.get(scan_id)
                 if (pose != scan.pose).any():
-                    moved[scan_id] = scan.at(pose.copy())
+                    moved[scan_id] = dataclasses.replace(scan, pose=pose.copy())
             return self._state.exchange(moved, moved)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
@@ -416,9 +404,8 @@ class LiveMap:
             If it cannot be read, or another map uses `folder`.
         """
         described, scans, sums = load_state(path)
-        config = FitConfig.from_dict(described.config)
         live = cls(
-            config,
+            FitConfig.from_dict(described.config),
             origin=described.origin,
             max_bytes=described.max_bytes,
             folder=folder,
@@ -468,20 +455,20 @@ class LiveMap:
             sealed = f"{self.sealed_scans} scans were sealed by max_bytes or clear_outside"
             check(not self.sealed_scans, f"{sealed}: give the map a folder to keep scans in")
             scans, origin = self._state.scans(), self._state.origin
+        poses = np.stack([scan.pose for scan in scans])
         intensities = [scan.intensities for scan in scans if scan.intensities is not None]
+        drive = self._drive(scans, poses, intensities=intensities or None)
+        return fit(drive, config=self.config, progress=progress, origin=origin)
+
+    def _drive(self, scans: list[LoggedScan], poses: Floats, **known: Any) -> Scans:
         speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
-        return fit(
-            Scans(
-                [scan.points for scan in scans],
-                np.stack([scan.pose for scan in scans]),
-                intensities or None,
-                doppler_mps=speeds if len(speeds) == len(scans) else None,
-                sensors=None if self._state.mountings is None else [scan.label for scan in scans],
-                T_body_sensor=self._state.mountings,
-            ),
-            config=self.config,
-            progress=progress,
-            origin=origin,
+        return Scans(
+            [scan.points for scan in scans],
+            poses,
+            doppler_mps=speeds if len(speeds) == len(scans) else None,
+            sensors=None if self._state.mountings is None else [scan.label for scan in scans],
+            T_body_sensor=self._state.mountings,
+            **known,
         )
 
 

@@ -15,9 +15,9 @@ from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import FitInput
 from radarsdf.interrupts import at_once
-from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, region_places, regions_of
-from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, rig_of_scans, save_state
-from radarsdf.live.surface import GrowingSurface
+from radarsdf.live import store
+from radarsdf.live.store import Described, LoggedScan, ScanId, ScanLog, rig_of_scans
+from radarsdf.live.surface import NO_KEYS, REGION_BITS, REGION_CELLS, GrowingSurface, regions_of
 from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale
@@ -61,7 +61,6 @@ class GrowingState:
         self.max_bytes = max_bytes
         self.log = ScanLog(folder, mountings)
         self.track = Track()
-        self._store = RegionStore(folder)
         self._away = NO_KEYS  # ascending keys of the regions on disk
         self._num_threads = resolve_num_threads(config.num_threads)
         self.sums = GrowingSums()
@@ -124,9 +123,9 @@ class GrowingState:
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
-        if self._store.folder is not None:
+        if self.log.folder is not None:
             regions = regions_of(keys << BLOCK_BITS)
-            lower = region_places(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
+            lower = lattice_of(regions << REGION_BITS) * self.config.leaf_size_m + self.origin
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
             return self._put_away(regions[np.square(nearest - centre).sum(axis=1) > radius_m**2])
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
@@ -147,13 +146,13 @@ class GrowingState:
     def _bring_back(self, regions: Keys) -> None:
         regions = np.intersect1d(regions, self._away)
         if len(regions):
-            blocks, columns = self._store.read(regions)
+            blocks, columns = store.read_regions(self.log.folder, regions)
             away = np.setdiff1d(self._away, regions)
             self._commit(partial(self.sums.insert, *columns), blocks, _away=away)
-            self._store.unlink(regions)
+            store.unlink_regions(self.log.folder, regions)
 
     def _put_away(self, regions: Keys) -> Keys:
-        blocks, written = self._store.write(self.sums, regions)
+        blocks, written = store.write_regions(self.log.folder, self.sums, regions)
         away = np.union1d(self._away, written)
         return self._commit(partial(self.sums.erase, blocks), blocks, _away=away)
 
@@ -199,15 +198,14 @@ class GrowingState:
             mountings=mountings,
             radars=[] if self.mountings is None else [[*self.mountings].index(scan.label) for scan in scans],
         )
-        save_state(path, described, scans, self.sums)
+        store.save_state(path, described, scans, self.sums)
 
     def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[Array]) -> None:
         """Restore a saved state into a new one."""
         self.sums.insert(*sums)
         self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
         self.next_id, self.with_intensities = described.next_id, described.with_intensities
-        for scan_id, scan in zip(described.ids, scans, strict=True):
-            self.log.put(scan_id, scan)
+        self.log = self.log.exchanged(dict(zip(described.ids, scans, strict=True)), ())
         self.log.sealed |= set(described.sealed)
         self._bound()
 

@@ -3,7 +3,7 @@
 import itertools
 import sqlite3
 import weakref
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from radarsdf.arrays import Array, Bools, Floats, Floats32, Keys
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, check_values_of_scan, positions
 from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
-from radarsdf.live.regions import REGION_BITS
+from radarsdf.live.surface import REGION_BITS
 from radarsdf.returns.evidence import BLOCK_BITS
 from radarsdf.rig import Label, Mounted, Rig, checked_mountings
 
@@ -91,37 +91,17 @@ class LoggedScan:
     def num_bytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
 
-    def at(self, pose: Floats) -> "LoggedScan":
-        return replace(self, pose=pose)
-
 
 def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
     known = [scan.radar for scan in scans if scan.radar is not None]
     return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
 
-def _scan_of(
-    arrays: Mapping[str, Array], pose: Floats, time_s: float | None, radar: Mounted | None
-) -> LoggedScan:
-    """Build a scan from the arrays of its file. Raise a KeyError or a ValueError if it is damaged."""
-    points = positions(arrays["points"], "points")
-    for name, array in arrays.items():
-        if name != "points":
-            check_values_of_scan(array, points, name, 0)
-        check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
-    return LoggedScan(pose, **arrays, time_s=time_s, radar=radar)
-
-
 class _Rows:
     """Rows of scans in a file, which never change: a change of the map adds others, so that it can be undone."""
 
     def __init__(self, folder: Path | None) -> None:
-        self.folder = folder
-
-    @property
-    def _path(self) -> Path:
-        assert self.folder is not None
-        return self.folder / _SCANS
+        self._path = (folder or Path()) / _SCANS  # without a folder, nothing is read or written
 
     @cached_property
     def _opened(self) -> sqlite3.Connection:
@@ -215,10 +195,16 @@ class ScanLog:
             return _pose_of(row[2]), row[3]
         return None if held is None else (held.pose, held.time_s)
 
-    def _find(self, scan_id: ScanId) -> LoggedScan | None:
+    def get(self, scan_id: ScanId) -> LoggedScan:
+        """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
+        sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
+        check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
         row = self._row(scan_id)
         if row is None:
-            return self._scans.get(scan_id)
+            if scan_id not in self._scans:
+                msg = f"the map has no scan {scan_id!r}"
+                raise KeyError(msg)
+            return self._scans[scan_id]
         number, _, pose, time_s = row
         columns = f"radar, {', '.join(_KINDS)} FROM scans WHERE number = ?"
         ((radar, *blobs),) = self._rows.read(columns, number)
@@ -230,46 +216,33 @@ class ScanLog:
         mounted = None if radar is None else self._radars[radar]
         return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted)
 
-    def get(self, scan_id: ScanId) -> LoggedScan:
-        """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
-        sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
-        check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
-        found = self._find(scan_id)
-        if found is None:
-            msg = f"the map has no scan {scan_id!r}"
-            raise KeyError(msg)
-        return found
-
     def scans(self, every: int = 1) -> Iterator[LoggedScan]:
         """Iterate over every n-th scan that can be removed, in order."""
         return (self.get(scan_id) for scan_id in self.ids[::every])
 
-    def put(self, scan_id: ScanId, scan: LoggedScan) -> None:
-        """Add a scan, or replace it in place."""
-        before = self._scans.get(scan_id)
-        self._scans[scan_id] = scan
-        self.num_bytes += scan.num_bytes - (0 if before is None else before.num_bytes)
-
-    def exchanged(
-        self, new: Mapping[ScanId, LoggedScan], old: Iterable[ScanId], sealed: Iterable[ScanId] = ()
-    ) -> "ScanLog":
+    def exchanged(self, new: Mapping[ScanId, LoggedScan], old: Collection[ScanId]) -> "ScanLog":
         """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
-        old, sealed = set(old), set(sealed)
-        log = copy(self)
-        log._scans = self._scans.copy()
-        log.edits += bool(old)
-        if sealed:
-            log.sealed = self.sealed | sealed
         stored = {scan_id: row for scan_id in old if (row := self._row(scan_id)) is not None}
+        log = self._without(set(old) - new.keys() - stored.keys())
+        log.edits += bool(old)
         log._gone = self._gone.union(number for number, *_ in stored.values())
         log._stored -= len(stored)
-        for scan_id in (old | sealed) - new.keys() - stored.keys():
-            log.num_bytes -= log._scans.pop(scan_id).num_bytes
         log._write(
             [(place, scan_id, new[scan_id]) for scan_id, (_, place, *_) in stored.items() if scan_id in new]
         )
-        for scan_id in new.keys() - stored.keys():
-            log.put(scan_id, new[scan_id])
+        held = {scan_id: scan for scan_id, scan in new.items() if scan_id not in stored}
+        log.num_bytes += sum(scan.num_bytes for scan in held.values())
+        log.num_bytes -= sum(log._scans[scan_id].num_bytes for scan_id in held.keys() & log._scans.keys())
+        log._scans |= held  # in place of those with the same ids
+        return log
+
+    def _without(self, held: Iterable[ScanId], *, sealed: bool = False) -> "ScanLog":
+        """Return a log without the scans `held` in memory. `sealed`: these stay in the map."""
+        log, gone = copy(self), set(held)
+        log._scans = self._scans.copy()
+        for scan_id in gone:
+            log.num_bytes -= log._scans.pop(scan_id).num_bytes
+        log.sealed = self.sealed | gone if sealed else self.sealed
         return log
 
     def _write(self, scans: Sequence[tuple[int, ScanId, LoggedScan]]) -> None:
@@ -301,13 +274,9 @@ class ScanLog:
                 break
             excess -= scan.num_bytes
             oldest.append(scan_id)
-        if self.folder is None:
-            return self.exchanged({}, (), oldest)
-        log = copy(self)
-        log._write([(self._end + i, scan_id, self._scans[scan_id]) for i, scan_id in enumerate(oldest)])
-        log._scans = self._scans.copy()
-        for scan_id in oldest:
-            log.num_bytes -= log._scans.pop(scan_id).num_bytes
+        log = self._without(oldest, sealed=self.folder is None)
+        if self.folder is not None:
+            log._write([(self._end + i, scan_id, self._scans[scan_id]) for i, scan_id in enumerate(oldest)])
         return log
 
     def sealed_beyond(self, centre: Floats, radius_m: float) -> "ScanLog":
@@ -317,48 +286,43 @@ class ScanLog:
             reach_m = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1).max())
             if np.linalg.norm(scan.pose[:3, 3] - centre) + reach_m > radius_m:
                 sealed.append(scan_id)
-        return self.exchanged({}, (), sealed)
+        return self._without(sealed, sealed=True)
 
 
 def _pose_of(blob: bytes) -> Floats:
     return np.frombuffer(blob).reshape(4, 4).copy()
 
 
-class RegionStore:
-    """Region store: sums of regions on disk, one file each in `folder`, restored bit-identically."""
+def _region_paths(folder: Path | None, regions: Keys) -> list[Path]:
+    """Return the files of regions (R,), which hold their sums bit-identically."""
+    return [(folder or Path()) / f"region-{region:016x}.npz" for region in regions.tolist()]
 
-    def __init__(self, folder: Path | None) -> None:
-        self.folder = folder
 
-    def _path(self, region: int) -> Path:
-        assert self.folder is not None
-        return self.folder / f"region-{region:016x}.npz"
+def write_regions(folder: Path | None, sums: GrowingSums, regions: Keys) -> tuple[Keys, Keys]:
+    """Write those of `regions` that are in `sums`. Return the ascending keys of their blocks, and theirs."""
+    blocks = sums.block_keys()
+    region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
+    written = np.intersect1d(regions, region_of_block)
+    for region, path in zip(written, _region_paths(folder, written), strict=True):
+        _save(path, **arrays_of_sums(sums, blocks[region_of_block == region]))
+    return blocks[np.isin(region_of_block, written)], written
 
-    def write(self, sums: GrowingSums, regions: Keys) -> tuple[Keys, Keys]:
-        """Write those of `regions` that are in `sums`. Return the ascending keys of their blocks, and theirs."""
-        blocks = sums.block_keys()
-        region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
-        written = np.intersect1d(regions, region_of_block)
-        for region in written.tolist():
-            own = blocks[region_of_block == region]
-            _save(self._path(region), **arrays_of_sums(sums, own))
-        return blocks[np.isin(region_of_block, written)], written
 
-    def read(self, regions: Keys) -> tuple[Keys, list[Array]]:
-        """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums."""
-        read = []
-        for path in map(self._path, regions.tolist()):
-            with reading(path, "a whole region of a live map"):
-                read.append(_sums_of(arrays_of(path, _CELL_COLUMNS)))
-        columns = [np.concatenate(parts) for parts in zip(*read, strict=True)]
-        keys, _, _, visibility_keys, _ = columns
-        return np.union1d(visibility_keys, keys >> BLOCK_BITS), columns
+def read_regions(folder: Path | None, regions: Keys) -> tuple[Keys, list[Array]]:
+    """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums."""
+    read = []
+    for path in _region_paths(folder, regions):
+        with reading(path, "a whole region of a live map"):
+            read.append(_sums_of(arrays_of(path, _CELL_COLUMNS)))
+    columns = [np.concatenate(parts) for parts in zip(*read, strict=True)]
+    keys, _, _, visibility_keys, _ = columns
+    return np.union1d(visibility_keys, keys >> BLOCK_BITS), columns
 
-    def unlink(self, regions: Keys) -> None:
-        """Delete the files of regions that are in memory again."""
-        for region in regions.tolist():
-            with suppress(OSError):  # a leftover file is harmless
-                self._path(region).unlink()
+
+def unlink_regions(folder: Path | None, regions: Keys) -> None:
+    for path in _region_paths(folder, regions):
+        with suppress(OSError):  # a leftover file is harmless
+            path.unlink()
 
 
 def arrays_of_sums(sums: GrowingSums, blocks: Keys) -> dict[str, Array]:
@@ -426,6 +390,12 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
         scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
         numbers = described.radars if radars else [0] * len(names)
         for of_scan, pose, time_s, k in zip(names, described.poses, described.times_s, numbers, strict=True):
-            held = {name: arrays[key] for key, name in of_scan.items() if key in arrays}
-            scans.append(_scan_of(held, check_pose(pose, "pose"), time_s, radars[k] if radars else None))
+            held: dict[str, Any] = {name: arrays[key] for key, name in of_scan.items() if key in arrays}
+            points = positions(held["points"], "points")
+            for name, array in held.items():
+                if name != "points":
+                    check_values_of_scan(array, points, name, 0)
+                check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
+            mounted = radars[k] if radars else None
+            scans.append(LoggedScan(check_pose(pose, "pose"), **held, time_s=time_s, radar=mounted))
         return described, scans, _sums_of(arrays)

@@ -5,7 +5,7 @@ import dataclasses
 import operator
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -124,21 +124,16 @@ class _Judged:
     doubts: tuple[str, ...] = (_NOT_COMPARED,)
 
 
-@dataclass
 class Follower:
     """Tracker of the sensor. A cache: the map owns the track and the poses, which are read before each scan."""
 
-    config: FitConfig
-    num_radars: int = 1
-    _judged: dict[Label | None, _Judged] = field(default_factory=dict)  # by label of a radar
-    _edits: int = 0  # of the log, when the poses were read
-    _complete: bool = False  # False while the attributes below change, or if that was interrupted
-    _steps: deque[Step] = field(init=False)
-    _rates: deque[tuple[MotionRate, MotionRate]] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._steps = deque(maxlen=_STEPS * self.num_radars)
-        self._rates = deque(maxlen=_STEPS * self.num_radars - 1)
+    def __init__(self, config: FitConfig, num_radars: int) -> None:
+        self.config, self.num_radars = config, num_radars
+        self._judged: dict[Label | None, _Judged] = {}  # by label of a radar
+        self._edits = 0  # of the log, when the poses were read
+        self._complete = False  # False while the attributes below change, or if that was interrupted
+        self._steps: deque[Step] = deque(maxlen=_STEPS * num_radars)
+        self._rates: deque[tuple[MotionRate, MotionRate]] = deque(maxlen=_STEPS * num_radars - 1)
 
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
@@ -252,11 +247,12 @@ class Follower:
             steps = [now for step in steps if (now := _now(step, log)) is not None]
         new = next((more for more in (0, 1) if self._complete and self._continued_by(steps, more)), None)
         self._complete = False
-        if new is None:
-            self._begin(steps)
-        else:
-            for step in steps[len(steps) - new :]:
-                self._add(step)
+        if new is None:  # reset to the state after only these scans
+            self._steps.clear()
+            self._rates.clear()
+            new = len(steps)
+        for i in range(len(steps) - new, len(steps)):
+            self._add(steps[i], planes=i >= len(steps) - WINDOW * self.num_radars)
         for scan_id, logged in track.given:
             found = Tracked(logged.pose, _GIVEN, 1.0, 0, np.zeros(3))
             now = _now(Step(scan_id, logged, self._velocity(logged), found), log)
@@ -269,13 +265,6 @@ class Follower:
         before = [*self._steps][max(0, len(self._steps) + new - _STEPS * self.num_radars) :]
         poses = ([step.found.pose for step in each] for each in (before, steps[: len(steps) - new]))
         return len(before) + new == len(steps) and all(map(operator.is_, *poses))
-
-    def _begin(self, steps: Sequence[Step]) -> None:
-        """Reset to the state after only these scans."""
-        self._steps.clear()
-        self._rates.clear()
-        for i, step in enumerate(steps):
-            self._add(step, planes=i >= len(steps) - WINDOW * self.num_radars)
 
     def _add(self, step: Step, *, planes: bool = True) -> None:
         if self._steps:
@@ -373,14 +362,12 @@ class Follower:
             return [self._next(new, sign)]
         frame = steps[first].found.pose
         both = np.kron(np.eye(2), frame[:3, :3])
-        placed = [
-            dataclasses.replace(one, pose=frame @ one.pose, covariance=both @ one.covariance @ both.T)
-            for one in tracked[1:]
-        ]
-        return [
-            dataclasses.replace(step, found=found, sign=sign)
-            for step, found in zip(steps[first + 1 :], placed, strict=True)
-        ]
+        again = []
+        for step, found in zip(steps[first + 1 :], tracked[1:], strict=True):
+            covariance = both @ found.covariance @ both.T
+            placed = dataclasses.replace(found, pose=frame @ found.pose, covariance=covariance)
+            again.append(dataclasses.replace(step, found=placed, sign=sign))
+        return again
 
     def _followed(self, steps: list[Step], sign: int) -> tuple[int, list[Tracked]]:
         """Return the sign of the Doppler, 0 if not significant, and the scans tracked by odometry, in the frame of the first."""

@@ -115,7 +115,12 @@ def _probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
     columns = terms(contents, evidence)
     logits = torch.tensor([_CONFIDENCE, _COVERING], dtype=torch.float64, device="cpu")
     true, covering = ((columns * logit).sum(1).clamp(min=_LEAST_LOGIT).sigmoid() for logit in logits)
-    reach = torch.erf(math.sqrt(0.5) / _smoothed(columns[:, 1].exp()))
+    # For a thin plate with second differences of standard deviation b cells, and returns of information density ρ per cell, the
+    # variance is 1 / (8 √(ρ / b²)). Where the returns alone are more precise, the neighbourhood adds nothing.
+    error_cells = columns[:, 1].exp()  # of the returns near each place alone
+    density = 1 / (CELLS_OF_SURFACE * error_cells.square())
+    smoothed_cells = error_cells.minimum((_BEND_CELLS / (8 * density.sqrt())).sqrt())
+    reach = torch.erf(math.sqrt(0.5) / smoothed_cells)
     own = own_surface(evidence)
     found = (true * own).minimum(reach), covering * own, reach
     return Probabilities(*(column.numpy() for column in found))
@@ -150,14 +155,6 @@ def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 def _as_tensors(evidence: EvidenceAt) -> Iterator[Tensor]:
     """Convert the columns to float64. PyTorch's functions compute several numbers at a time, NumPy's and SciPy's do not."""
     return (torch.from_numpy(column).double() for column in evidence)
-
-
-def _smoothed(error_cells: Tensor) -> Tensor:
-    """Return standard errors (N,) of a smooth surface, leaf cells, from `error_cells` of the returns near each place alone."""
-    # For a thin plate with second differences of standard deviation b cells, and returns of information density ρ per cell, the
-    # variance is 1 / (8 √(ρ / b²)). Where the returns alone are more precise, the neighbourhood adds nothing.
-    density = 1 / (CELLS_OF_SURFACE * error_cells.square())
-    return error_cells.minimum((_BEND_CELLS / (8 * density.sqrt())).sqrt())
 
 
 _ODDS_CELLS = 50_000  # sample of leaf cells that calibrates the weight of free-space crossings

@@ -74,7 +74,7 @@ class Map(ABC):
             :meth:`observed`, or is not finite. It is learnt along the sensor's rays, so it exceeds the Euclidean distance at
             grazing incidence.
         """
-        world, answer = _as_positions(x)
+        world, answer = as_positions(x)
         if return_gradient:
             planes = self._evaluate(queries.plane, world, extrapolate=extrapolate)
             return answer(planes[:, 0]), answer(planes[:, 1:])
@@ -89,7 +89,7 @@ class Map(ABC):
             Derivatives along x, y and z of the world, pointing to free space. The norm is about 1 where rays met the surface at
             normal incidence, and larger at grazing incidence. NaN where :meth:`sdf` is.
         """
-        world, answer = _as_positions(x)
+        world, answer = as_positions(x)
         return answer(self._evaluate(queries.plane, world, extrapolate=extrapolate)[:, 1:])
 
     def observed(self, x: Any) -> Any:
@@ -97,7 +97,7 @@ class Map(ABC):
 
         Where the result, (N,) bool, is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
         """
-        world, answer = _as_positions(x)
+        world, answer = as_positions(x)
         return answer(self._observed(world))
 
     def uncertainty(self, x: Any) -> Any:
@@ -112,7 +112,7 @@ class Map(ABC):
             NaN where there are no returns near `x`, or `x` is not finite. Pose errors are included if ``returns.pose_sigma_m``
             and ``pose_sigma_rad`` of the :class:`FitConfig` specify them.
         """
-        world, answer = _as_positions(x)
+        world, answer = as_positions(x)
         return answer(uncertainty(self.contents_of_any, self.evidence_at(world)))
 
     def confidence(self, x: Any) -> Any:
@@ -130,7 +130,7 @@ class Map(ABC):
         place, the map's clutter ratio, and its returns per cell. It was trained on simulated scenes and five real drives; on
         other kinds of scenes, the worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
         """
-        world, answer = _as_positions(x)
+        world, answer = as_positions(x)
         return answer(confidence(self.contents_of_any, self.evidence_at(world)))
 
     def intensity(
@@ -171,8 +171,8 @@ class Map(ABC):
         """
         radar = self._radar(sensor)
         check(self.has_intensity, "this map was fitted without intensities")
-        world, answer = _as_positions(x)
-        sensors, _ = _as_positions(sensor_positions, rows=len(world))
+        world, answer = as_positions(x)
+        sensors, _ = as_positions(sensor_positions, rows=len(world))
         query = partial(queries.intensity, extrapolate=extrapolate)
         return answer(radar.measured(self._evaluate(query, world, sensors, extrapolate=extrapolate)))
 
@@ -474,7 +474,7 @@ class Map(ABC):
         return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
 
 
-def _as_positions(x: Any, rows: int | None = None) -> tuple[Floats, Callable[[Array], Any]]:
+def as_positions(x: Any, rows: int | None = None) -> tuple[Floats, Callable[[Array], Any]]:
     """Convert `x` to positions (N, 3), and return a function that converts results back; (3,) is broadcast to `rows`."""
     is_tensor = isinstance(x, Tensor)
     if is_tensor and (x.device.type != "cpu" or x.layout != torch.strided or x.is_complex()):

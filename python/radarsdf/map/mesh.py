@@ -1,7 +1,7 @@
 """Mesh extraction: distances at the corners of voxels, triangles, and filtering by evidence."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -63,14 +63,17 @@ class Surface:
         sigma_m = uncertainty(scene, evidence)
         return cls(vertices, faces, confidence, sigma_m, tally, cells_searched)
 
-    def kept(self, limits: Limits) -> Bools:
-        """Return a mask (F,) of the faces within the limits, without small components."""
+    def kept(self, limits: Limits, open_at: Sequence[int] | Ints = ()) -> Bools:
+        """Return a mask (F,) of the faces within the limits, without small components that use no vertex of `open_at` (B,)."""
         min_confidence = self.tally.threshold(limits.min_confidence).min_confidence
         kept = with_all(limits.met(min_confidence, self.confidence, self.uncertainty_m), self.faces)
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces.take(rows, axis=0), len(self.vertices))
-            kept[rows] = (sizes >= limits.min_component_triangles).take(labels)
+            large = sizes >= limits.min_component_triangles
+            if len(open_at):
+                large[labels[np.isin(self.faces[rows], open_at).any(axis=1)]] = True
+            kept[rows] = large.take(labels)
         return kept
 
     def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> trimesh.Trimesh:

@@ -172,8 +172,12 @@ def view_from(
     if flag(noise, "noise"):
         seed = seed if isinstance(seed, np.random.Generator) else whole_number(seed, "seed", 0)
         points = _with_noise(points, sensor, np.random.default_rng(seed))
-    first_m = _first_surface(surface, pose[:3, :3], position, sensor, azimuth, elevation)
-    return View(pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, first_m)
+    grid = np.meshgrid(elevation, azimuth, indexing="ij")
+    directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), pose[:3, :3])
+    first_m = surface.ranges(position, directions, float(sensor.range_m[1]))
+    first_m[~np.isfinite(first_m) | (first_m < sensor.range_m[0])] = np.nan
+    of_beams = azimuth, elevation, first_m.reshape(grid[0].shape)
+    return View(pose, sensor, points.astype(np.float32), intensities, *of_beams)
 
 
 def _polar(points: Floats) -> tuple[Floats, Floats, Floats]:
@@ -241,14 +245,3 @@ def _beams(sensor: Sensor) -> tuple[Floats, Floats]:
     azimuth = first + (np.arange(counts[0]) + 0.5) * ((last - first) / counts[0])
     elevation = lowest + (np.arange(counts[1]) + 0.5) * ((highest - lowest) / counts[1])
     return np.asarray(azimuth, np.float64), np.asarray(elevation, np.float64)
-
-
-def _first_surface(
-    surface: ViewedMap, R: Floats, position: Floats, sensor: Sensor, azimuth: Floats, elevation: Floats
-) -> Floats32:
-    """Return the range (E, A) of the first surface along each beam; NaN where there is none."""
-    grid = np.meshgrid(elevation, azimuth, indexing="ij")
-    directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)
-    ranges_m = surface.ranges(position, directions, float(sensor.range_m[1]))
-    met = np.isfinite(ranges_m) & (ranges_m >= sensor.range_m[0])
-    return np.where(met, ranges_m, np.float32(np.nan)).reshape(grid[0].shape)

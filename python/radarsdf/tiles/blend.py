@@ -11,10 +11,11 @@ import numpy as np
 
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
 from radarsdf.checks import AnyPath, check, positive
-from radarsdf.map import queries, storage
+from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence
 from radarsdf.map.map import Map, Query
 from radarsdf.map.queries import MapContents
+from radarsdf.map.radar_map import load_contents, load_leaf_keys
 from radarsdf.returns.sums import lattice_of
 from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path
 
@@ -67,7 +68,7 @@ class TileBlend(Map):
         """The map of a finished tile, cached in memory."""
         with self._lock:
             if tile not in self._held:
-                contents = storage.load_contents(map_path(self.folder, self.plan.by_tile[tile]))
+                contents = load_contents(map_path(self.folder, self.plan.by_tile[tile]))
                 size = round(_OF_FEATURES * sum(p.nbytes for p in contents.field.parameters()))
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)
@@ -77,7 +78,7 @@ class TileBlend(Map):
 
     def leaf_cells(self, of: Tile, within: Tile) -> Ints:
         """(C, 3) leaf cells, by lattice indices, of the map of one finished tile that lie in another one."""
-        keys = storage.load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
+        keys = load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
         cells = lattice_of(keys).astype(np.int64) + self.plan.origin_cells(of)
         return cells[(cells[:, :2] // self.plan.tile_cells == within).all(axis=1)]
 

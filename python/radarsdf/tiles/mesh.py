@@ -19,8 +19,8 @@ from radarsdf.io.files import check_outputs, checked_suffix, reading, write_whol
 from radarsdf.io.meshes import MATT, MESH_SUFFIXES, T_GLTF_WORLD, encode_glb, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
-from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.mesh import Surface, crossed, one_for_equal, per_cell, renumbered, subdivided, with_all
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.mesh import Surface, crossed, one_for_equal, per_cell, renumbered, subdivided
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
@@ -163,16 +163,10 @@ def _separate(
     city: TileBlend, paths: Sequence[Path], limits: Limits, tally: Tally
 ) -> Iterator[tuple[Floats, Ints32]]:
     """Yield vertices (V, 3), world, m, and faces (F, 3) tile by tile. Components that reach a border are kept."""
-    least = tally.threshold(limits.min_confidence).min_confidence
     for path in paths:
         vertices, faces, confidence, uncertainty_m, *_ = _read(path).values()
-        faces = faces[with_all(limits.met(least, confidence, uncertainty_m), faces)]
-        labels, sizes = mesh_components(faces, len(vertices))
-        on_border = np.zeros(len(vertices), bool)
-        on_border[_on_borders(city, vertices)] = True
-        large = sizes >= limits.min_component_triangles
-        large[labels[on_border[faces].any(axis=1)]] = True
-        used, faces = renumbered(len(vertices), faces[large[labels]])
+        part = Surface(vertices, faces, confidence, uncertainty_m, tally, len(faces))
+        used, faces = renumbered(len(vertices), faces[part.kept(limits, _on_borders(city, vertices))])
         yield vertices[used], faces
 
 

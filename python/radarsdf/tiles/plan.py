@@ -20,7 +20,7 @@ from radarsdf.checks import MAX_POSITION_M, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors
-from radarsdf.map.storage import checked_report
+from radarsdf.map.radar_map import checked_report
 from radarsdf.returns.noise import RigNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Radars, Sensor, in_map_unit
@@ -230,15 +230,14 @@ class Plan:
                 config=FitConfig.from_dict(described.pop("config")),
                 sensor=Sensor.from_dict(described.pop("sensor")),
                 tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
-                radars=tuple(_radar_of(radar) for radar in described.pop("radars")),
+                radars=tuple(
+                    RadarPlan(**radar | {"sensor": Sensor.from_dict(radar["sensor"])})
+                    for radar in described.pop("radars")
+                ),
                 **described,
             )
             check(plan._file_bytes() == content, "its checksum is wrong")
             return plan
-
-
-def _radar_of(described: dict[str, Any]) -> RadarPlan:
-    return RadarPlan(**described | {"sensor": Sensor.from_dict(described["sensor"])})
 
 
 def folder_of(folder: Path, tile: Tile) -> Path:

@@ -256,10 +256,6 @@ class _Planner:
             in_cells += float(surfels.counts[held].sum())
             cells += len(held)
         noise = SensorNoise.median(noises)
-        of_cells: dict[str, Any] = {
-            "clutter_ratio": clutter / returns,
-            "returns_per_cell": in_cells / max(cells, 1),
-        }
         radars, of_radar = [], map(SensorNoise.median, zip(*of_radars, strict=True))
         same_unit = _median_units(units)
         for radar, own, unit in zip(plan.radars, of_radar, same_unit, strict=True):
@@ -274,19 +270,17 @@ class _Planner:
             sensor=dataclasses.replace(sensor, noise=noise),
             radars=tuple(radars),
             tiles=tuple(sorted(tiles, key=lambda tile: tile.tile)),
-            **of_cells,
+            clutter_ratio=clutter / returns,
+            returns_per_cell=in_cells / max(cells, 1),
         )
 
     def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
         """Estimate a sensor without noise from the samples of radars, with the intensities in one unit."""
-        points, values = [], []
-        for own, unit in radars:
-            for _, scan in own.samples:
-                points.append(scan.points)
-                if scan.intensities is not None:
-                    values.append(in_map_unit(np.asarray(scan.intensities), unit))
+        scans = [(scan, unit) for own, unit in radars for _, scan in own.samples]
+        measured = [(np.asarray(s.intensities), unit) for s, unit in scans if s.intensities is not None]
+        values = [in_map_unit(*own) for own in measured]
         limits = {name: getattr(self._config.returns, name) for name in ("min_range_m", "max_range_m")}
-        return Sensor.of(points, values or None, **limits)
+        return Sensor.of([scan.points for scan, _ in scans], values or None, **limits)
 
 
 def _median_units(of_tiles: list[tuple[Unit | None, ...]]) -> list[Unit]:

@@ -9,10 +9,9 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import AnyPath, path_of
-from radarsdf.map import storage
 from radarsdf.map.confidence import CellsInBox, dense_cells
 from radarsdf.map.map import Map
-from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.radar_map import RadarMap, load_contents
 from radarsdf.map.threshold import VOXEL_M, Threshold
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
@@ -213,7 +212,7 @@ def load(path: AnyPath) -> Map:
         If it is no radarsdf map, is damaged, of another version, or cannot be read.
     """
     path = path_of(path, "path")
-    return TiledMap(path) if path.is_dir() else RadarMap(storage.load_contents(path))
+    return TiledMap(path) if path.is_dir() else RadarMap(load_contents(path))
 
 
 def lacking(radar_map: Map) -> str:
