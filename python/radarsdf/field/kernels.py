@@ -225,9 +225,14 @@ class _MLP(torch.autograd.Function):
     def forward(ctx: Any, num_layers: int, *tensors: Tensor) -> Tensor:
         layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
         out = inputs[0].new_empty((len(inputs[0]), len(layers[-1])))
-        layer_views = [view(layer) for layer in layers]
-        ctx.views = [rows_view(x) for x in inputs], layer_views[::2], layer_views[1::2]
-        ctx.hidden = _core.mlp(*ctx.views, out.numpy(), any(ctx.needs_input_grad), _num_threads())
+        of_layers: list[Any] = [view(layer) for layer in layers]
+        views: tuple[list[Any], list[Any], list[Any]] = (
+            [rows_view(x) for x in inputs],
+            of_layers[::2],
+            of_layers[1::2],
+        )
+        ctx.views = views
+        ctx.hidden = _core.mlp(*views, out.numpy(), any(ctx.needs_input_grad), _num_threads())
         ctx.save_for_backward(*tensors)
         ctx.num_layers = num_layers
         return out
