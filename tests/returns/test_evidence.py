@@ -75,7 +75,6 @@ def returns_of(rays, variances_m2):
     found = sorted(information)
     return ReturnsOfCells(
         keys=np.array(found, np.uint64),
-        weights=np.ones(len(found), np.float32),  # not used by evidence
         information=np.array([information[key] for key in found], np.float32),
         scans=np.array([len(scans_of_cell[key]) for key in found], np.uint32),
         counts=np.ones(len(found)),  # not used by evidence

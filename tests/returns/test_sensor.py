@@ -148,8 +148,8 @@ def test_variances_of_positions_by_range():
 
 def test_errors_of_poses_are_common_to_the_returns_of_a_scan():
     keys, scans = np.arange(3, dtype=np.uint64), np.array([1, 4, 2], np.uint32)
-    ones, information = np.ones(3, np.float32), np.array([100.0, 400, 25], np.float32)
-    returns = ReturnsOfCells(keys, ones, information, scans, np.ones(3))
+    information = np.array([100.0, 400, 25], np.float32)
+    returns = ReturnsOfCells(keys, information, scans, np.ones(3))
     ranges_m = np.array([10.0, 20, 5], np.float32)
     config = ReturnsConfig(pose_sigma_m=0.03, pose_sigma_rad=0.004)
     found = returns.with_uncertain_poses(ranges_m, config)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.checks import check, check_box, positions, whole_number
 from radarsdf.threads import resolve_num_threads
 
@@ -78,16 +78,15 @@ def surface_metrics(
     `samples`.
     """
     whole_number(samples, "samples", 1)
-    corners = None if box is None else check_box(box)
-    in_the_box = "" if corners is None else " in the box"
-    points = _in_box(positions(ground_truth, "ground_truth"), corners)
+    corners = np.array([[-np.inf] * 3, [np.inf] * 3]) if box is None else check_box(box)
+    in_the_box = "" if box is None else " in the box"
+    points = positions(ground_truth, "ground_truth")
+    points = points[_in_box(points, corners)]
     check(len(points), f"there are no ground-truth points{in_the_box}")
     vertices, faces = _triangles(mesh)
     # From here on relative to the mean: differences of large coordinates would lose precision.
     origin = points.mean(axis=0)
-    points, vertices = points - origin, vertices - origin
-    if corners is not None:
-        corners = corners - origin
+    points, vertices, corners = points - origin, vertices - origin, corners - origin
 
     workers = resolve_num_threads(0)
     tree = cKDTree(points)
@@ -188,18 +187,15 @@ def _triangles(mesh: "trimesh.Trimesh") -> tuple[Floats, Ints]:
     return vertices, faces.reshape(-1, 3).astype(np.int64)
 
 
-def _in_box(points: Floats, corners: Floats | None) -> Floats:
-    if corners is None:
-        return points
-    return points[((points >= corners[0]) & (points <= corners[1])).all(axis=1)]
+def _in_box(points: Floats, corners: Floats) -> Bools:
+    return ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
 
 
-def _sample_blocks(vertices: Floats, faces: Ints, corners: Floats | None, samples: int) -> Iterator[Floats]:
+def _sample_blocks(vertices: Floats, faces: Ints, corners: Floats, samples: int) -> Iterator[Floats]:
     """Sample uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
     rng = np.random.default_rng(0)
-    if corners is not None and len(faces):
-        x = vertices[faces]
-        faces = faces[((x.max(axis=1) >= corners[0]) & (x.min(axis=1) <= corners[1])).all(axis=1)]
+    x = vertices[faces]
+    faces = faces[((x.max(axis=1) >= corners[0]) & (x.min(axis=1) <= corners[1])).all(axis=1)]
     if len(faces) == 0:
         return
     # Sorted along a Morton curve with ten bits per axis.
@@ -216,7 +212,8 @@ def _sample_blocks(vertices: Floats, faces: Ints, corners: Floats | None, sample
         index = np.searchsorted(last, np.arange(start, min(start + _CHUNK, samples)), side="right")
         u, v = rng.random((2, len(index), 1))
         root = np.sqrt(u)
-        block = _in_box((1.0 - root) * a[index] + root * ((1.0 - v) * b[index] + v * c[index]), corners)
+        block = (1.0 - root) * a[index] + root * ((1.0 - v) * b[index] + v * c[index])
+        block = block[_in_box(block, corners)]
         if len(block):
             yield block
 
@@ -234,7 +231,7 @@ def _shorten(shortest: Floats, points: Floats, block: Floats, workers: int) -> N
     shortest[candidates] = np.minimum(known, distance)
 
 
-def _angles(vertices: Floats, faces: Ints, corners: Floats | None) -> Floats:
+def _angles(vertices: Floats, faces: Ints, corners: Floats) -> Floats:
     """Angles (E,) between the triangles of each edge with two: 0 in a plane, π where one is folded onto the other."""
     from trimesh.graph import face_adjacency  # noqa: PLC0415 - slow to import
 
@@ -243,10 +240,8 @@ def _angles(vertices: Floats, faces: Ints, corners: Floats | None) -> Floats:
     has_area = np.linalg.norm(normals, axis=1) > 0  # a degenerate triangle has no direction
     faces, normals = faces[has_area], normals[has_area]
     pairs, edges = face_adjacency(faces, return_edges=True)  # type: ignore[no-untyped-call]
-    if corners is not None:
-        middle = vertices[edges].mean(axis=1)
-        inside = ((middle >= corners[0]) & (middle <= corners[1])).all(axis=1)
-        pairs, edges = pairs[inside], edges[inside]
+    inside = _in_box(vertices[edges].mean(axis=1), corners)
+    pairs, edges = pairs[inside], edges[inside]
     # Two triangles of the same orientation traverse their common edge in opposite directions. Otherwise one normal is
     # flipped.
     forward = [

@@ -63,9 +63,11 @@ def trajectory_metrics(
     check(fits, f"align must be one of {', '.join(get_args(Alignment))}, not {align!r:.50}")
     true = check_poses(real_array(true_poses, "true_poses"))
     found = check_poses(poses, len(true))
-    at = found
-    if align != "none":
-        at = _with_positions(found, true) if align == "positions" else aligned(found, true)
+    at = aligned(found, true) if align == "poses" else found
+    if align == "positions":
+        from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (found, true))
+        whole = assembled(nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle)))
+        at = np.einsum("ij,fjk->fik", placed(whole, found, true), found)
     true_steps = steps(true)
     off = between(true_steps, steps(found))
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])
@@ -82,12 +84,6 @@ def trajectory_metrics(
         "relative_ratio": ratio,
         "relative_rad_per_m": rad_per_m,
     }
-
-
-def _with_positions(poses: Floats, true: Floats) -> Floats:
-    from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
-    whole = assembled(nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle)))
-    return np.einsum("ij,fjk->fik", placed(whole, poses, true), poses)
 
 
 def _relative(poses: Floats, true: Floats, distance_m: Floats) -> tuple[float | None, float | None]:

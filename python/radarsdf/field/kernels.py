@@ -44,9 +44,7 @@ def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.from_numpy(numbers[first : first + math.prod(shape)].reshape(shape))
 
 
-def threads() -> int:
-    """Return the number of threads for the core: that of PyTorch in the calling thread."""
-    return torch.get_num_threads()
+_num_threads = torch.get_num_threads  # of the core, too: those of PyTorch in the calling thread
 
 
 def _places(points: Tensor, located: Tensor, directions: Tensor | None) -> tuple[Any, Any, Any]:
@@ -57,17 +55,17 @@ def _interpolate(
     table: VertexTable, features: Tensor, points: Tensor, located: Tensor, directions: Tensor | None
 ) -> Tensor:
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-    table.interpolate(view(features), *_places(points, located, directions), out.numpy(), threads())
+    table.interpolate(view(features), *_places(points, located, directions), out.numpy(), _num_threads())
     return out
 
 
-def scatter(
+def _scatter(
     table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
 ) -> Tensor:
     """Return the gradient (num_rows, 8) of Σ interpolated · out_grad by the features, or of its derivatives along `directions`."""
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     places = _places(points, located, directions)
-    table.scatter(*places, rows_view(out_grad), features_grad.numpy(), threads())
+    table.scatter(*places, rows_view(out_grad), features_grad.numpy(), _num_threads())
     return features_grad
 
 
@@ -81,7 +79,9 @@ def _coordinate_gradient(
 ) -> Tensor:
     points_grad = torch.empty_like(points, memory_format=torch.contiguous_format)
     places = _places(points, located, directions)
-    table.coordinate_gradient(view(features), *places, rows_view(out_grad), points_grad.numpy(), threads())
+    table.coordinate_gradient(
+        view(features), *places, rows_view(out_grad), points_grad.numpy(), _num_threads()
+    )
     return points_grad
 
 
@@ -91,7 +91,9 @@ def _coordinate_gradient(
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
-        out, located = encode(features, points, table)
+        located = torch.empty((len(points), table.num_levels), dtype=torch.int32, device="cpu")
+        out = points.new_empty((len(points), FEATURE_DIM * table.num_levels))
+        table.encode(view(features), view(points), located.numpy(), out.numpy(), _num_threads())
         ctx.save_for_backward(features, points, located)
         ctx.table = table
         return out
@@ -120,7 +122,7 @@ class _InterpolateBackward(torch.autograd.Function):
         ctx.table = table
         ctx.set_materialize_grads(False)  # unused gradients are None, not zeros to interpolate
         return (
-            scatter(table, points, located, None, out_grad) if needs_features else None,
+            _scatter(table, points, located, None, out_grad) if needs_features else None,
             _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
         )
 
@@ -143,7 +145,7 @@ class _InterpolateBackward(torch.autograd.Function):
                 None if v is None else _interpolate(table, features, points, located, v),
             )
         if needs_features and v is not None:
-            features_grad = scatter(table, points, located, v, g)
+            features_grad = _scatter(table, points, located, v, g)
         if needs_points:
             points_grad = total(
                 None if a is None else _coordinate_gradient(table, a, points, located, None, g),
@@ -156,7 +158,7 @@ class _Fourier(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, half_width_m: float, first: int, count: int) -> Tensor:
         out = points.new_empty((points.shape[0], 6 * count))
-        _core.fourier(view(points), half_width_m, first, count, out.numpy(), threads())
+        _core.fourier(view(points), half_width_m, first, count, out.numpy(), _num_threads())
         ctx.save_for_backward(out)
         ctx.frequencies = (half_width_m, first, count)
         return out
@@ -183,18 +185,10 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
     return _Interpolate.apply(features, points, table)  # type: ignore[no-untyped-call]
 
 
-def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
-    """Return :func:`interpolate` without gradients, and the result of :func:`locate`."""
-    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
-    out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-    table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
-    return out, located
-
-
 def locate(points: Tensor, table: VertexTable) -> Tensor:
     """Return the rows (N, num_levels) int32, finest level first, of the occupied cells of points (N, 3), local, m; -1: none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
-    table.locate(view(points), located.numpy(), threads())
+    table.locate(view(points), located.numpy(), _num_threads())
     return located
 
 
@@ -209,7 +203,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
         msg = "spherical_harmonics has no gradient with respect to the directions"
         raise NotImplementedError(msg)
     out = directions.new_empty((directions.shape[0], NUM_SPHERICAL_HARMONICS))
-    _core.spherical_harmonics(view(directions), out.numpy(), threads())
+    _core.spherical_harmonics(view(directions), out.numpy(), _num_threads())
     return out
 
 
@@ -229,12 +223,16 @@ class _MLP(torch.autograd.Function):
     # `tensors`: weight and bias of each layer, then the inputs.
     @staticmethod
     def forward(ctx: Any, num_layers: int, *tensors: Tensor) -> Tensor:
-        inputs = tensors[2 * num_layers :]
-        out = inputs[0].new_empty((inputs[0].shape[0], tensors[2 * num_layers - 1].shape[0]))
-        keep = any(ctx.needs_input_grad)
-        views = _views(num_layers, tensors)
-        ctx.hidden = _core.mlp(*views, out.numpy(), keep, threads())
+        layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
+        out = inputs[0].new_empty((len(inputs[0]), len(layers[-1])))
+        of_layers: list[Any] = [view(layer) for layer in layers]
+        views: tuple[list[Any], list[Any], list[Any]] = (
+            [rows_view(x) for x in inputs],
+            of_layers[::2],
+            of_layers[1::2],
+        )
         ctx.views = views
+        ctx.hidden = _core.mlp(*views, out.numpy(), any(ctx.needs_input_grad), _num_threads())
         ctx.save_for_backward(*tensors)
         ctx.num_layers = num_layers
         return out
@@ -259,15 +257,9 @@ class _MLP(torch.autograd.Function):
         by_weights, by_biases = (views[:split:2], views[1:split:2]) if by_layers else (None, None)
         given: tuple[list[Any], list[Any], list[Any]] = ctx.views
         _core.mlp_backward(
-            *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
+            *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], _num_threads()
         )
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
-
-
-def _views(num_layers: int, tensors: Sequence[Tensor]) -> tuple[list[Any], list[Any], list[Any]]:
-    """Return inputs, weights and biases as views for the core."""
-    layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
-    return [rows_view(x) for x in inputs], [view(w) for w in layers[::2]], [view(b) for b in layers[1::2]]
 
 
 def _plain(num_layers: int, tensors: Sequence[Tensor]) -> Tensor:

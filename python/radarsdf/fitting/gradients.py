@@ -182,11 +182,33 @@ class AutogradGradients(GradientBackend):
         columns = [torch.split_with_sizes(column, sizes) for column in arrays]
 
         def of_part(i: int) -> Gradients:
-            # Parts may differ in size, and some of a small batch are empty.
-            shares = [counts[i] / max(sum(counts), 1) for counts in (sizes, seen)]
+            # Parts may differ in size, and some of a small batch are empty. Each has its shares of the means of the batch.
+            share, share_seen = (counts[i] / max(sum(counts), 1) for counts in (sizes, seen))
             points, sdf_m, of_ray = (column[i] for column in columns)
-            kept = [of_encoding[i] for of_encoding in factors]
-            return self._of_part(losses, points, sdf_m, of_ray, labelled[i], seen[i], shares, kept)
+            field, found, parameters = self._field, {}, list[Tensor]()
+            if losses == "sdf":
+                logit = field.logit(points)
+            else:
+                assert field.intensity_network is not None
+                geometry = field.geometry(points, frozen=losses == "intensity")
+                logit, rays = geometry.logit, of_ray[: seen[i]]
+                ranges_m = rays[:, _core.RAY_RANGE] - sdf_m[: seen[i]]
+                directions = rays[:, _core.RAY_DIRECTION : _core.RAY_RANGE]
+                kept = geometry.first(seen[i], [of_encoding[i] for of_encoding in factors])
+                predicted = field.intensity_network(kept, directions, ranges_m)
+                labels = rays[:, _core.RAY_INTENSITY].clone()
+                labels[labelled[i] :] = 0  # free space returns nothing (3QFPI)
+                # The mean of no samples would be NaN.
+                found["intensity"] = (
+                    intensity_loss(predicted, labels) * share_seen if seen[i] else predicted.sum()
+                )
+            if losses != "intensity":
+                found["sdf"] = sdf_loss(logit, sdf_m, field.sigma_m) * share if len(logit) else logit.sum()
+                parameters += [field.cells.features, *field.sdf_network.parameters()]
+            if field.intensity_network is not None and "intensity" in found:
+                parameters += field.intensity_network.parameters()
+            gradients = list(torch.autograd.grad(torch.stack(list(found.values())).sum(), parameters))
+            return Gradients({name: float(loss.detach()) for name, loss in found.items()}, gradients, None)
 
         parts = list(self._pool.map(of_part, range(len(sizes))))
         total = parts[0].by_parameters
@@ -194,37 +216,3 @@ class AutogradGradients(GradientBackend):
             torch._foreach_add_(total, part.by_parameters)
         summed = {name: sum(part.losses[name] for part in parts) for name in parts[0].losses}
         return Gradients(summed, total, None), meanwhile()
-
-    def _of_part(
-        self,
-        losses: Losses,
-        points: Tensor,
-        sdf_m: Tensor,
-        of_ray: Tensor,
-        labelled: int,
-        seen: int,
-        shares: list[float],
-        factors: list[Tensor],
-    ) -> Gradients:
-        """Differentiate the losses of one part, with its `shares` of the means of the batch, and its dropout `factors`."""
-        field, found, parameters = self._field, {}, list[Tensor]()
-        if losses == "sdf":
-            logit = field.logit(points)
-        else:
-            assert field.intensity_network is not None
-            geometry = field.geometry(points, frozen=losses == "intensity")
-            logit, rays = geometry.logit, of_ray[:seen]
-            ranges_m = rays[:, _core.RAY_RANGE] - sdf_m[:seen]
-            directions = rays[:, _core.RAY_DIRECTION : _core.RAY_RANGE]
-            predicted = field.intensity_network(geometry.first(seen, factors), directions, ranges_m)
-            labels = rays[:, _core.RAY_INTENSITY].clone()
-            labels[labelled:] = 0  # free space returns nothing (3QFPI)
-            # The mean of no samples would be NaN.
-            found["intensity"] = intensity_loss(predicted, labels) * shares[1] if seen else predicted.sum()
-        if losses != "intensity":
-            found["sdf"] = sdf_loss(logit, sdf_m, field.sigma_m) * shares[0] if len(logit) else logit.sum()
-            parameters += [field.cells.features, *field.sdf_network.parameters()]
-        if field.intensity_network is not None and "intensity" in found:
-            parameters += field.intensity_network.parameters()
-        gradients = list(torch.autograd.grad(torch.stack(list(found.values())).sum(), parameters))
-        return Gradients({name: float(loss.detach()) for name, loss in found.items()}, gradients, None)

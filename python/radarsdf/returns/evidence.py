@@ -58,21 +58,11 @@ class Evidence:
         return np.stack([self.information, self.hits, self.visibility, usual], 1, dtype=np.float32)
 
 
-def weights_of(counts: Floats32, ranges_m: Floats32, noise: SensorNoise) -> tuple[Floats32, Floats32]:
-    """Return the weights of groups of `counts` (M,) returns with about the same range (M,), m.
-
-    The first is their weight in averages of distances, relative to that of one return. The second, in smoothing, evidence and
-    uncertainty, is 1 / variance of the position, m⁻².
-    """
-    return counts, counts / noise.variances_m2(ranges_m)
-
-
 @dataclass(frozen=True)
 class ReturnsOfCells:
-    """Weights, number of scans and number of returns of each leaf cell, in the order of the keys."""
+    """Information, number of scans and number of returns of each leaf cell, in the order of the keys."""
 
     keys: Keys  # (M,) Morton keys of the leaf cells with returns, ascending
-    weights: Floats32  # (M,) sum of the weights of its returns in averages of distances
     information: Floats32  # (M,) 1 / variance of the position estimated from its returns, m⁻²
     scans: Counts32  # (M,) number of different scans with returns
     counts: Floats  # (M,) number of returns
@@ -84,21 +74,19 @@ class ReturnsOfCells:
         """Sum over all returns in each leaf cell."""
         cells = ReturnCells.of(rays, leaf_size_m, num_threads)
         parts = noise.weights(rays)
-        ones: Floats32 = np.broadcast_to(np.float32(1), len(rays))
-        ones = ones if parts is None else (parts / WEIGHT_UNIT).astype(np.float32)
-        of_rays = weights_of(ones, rays.ranges_m, noise)
-        sums = [np.bincount(cells.cell_of_ray, values, len(cells.keys)) for values in of_rays]
-        weights, information = (values.astype(np.float32) for values in sums)
+        weights = np.float32(1) if parts is None else (parts / WEIGHT_UNIT).astype(np.float32)
+        of_rays = weights / noise.variances_m2(rays.ranges_m)
+        information = np.bincount(cells.cell_of_ray, of_rays, len(cells.keys)).astype(np.float32)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m, len(cells.keys)) / cells.counts
-        found = cls(cells.keys, weights, information, scans, cells.counts)
+        found = cls(cells.keys, information, scans, cells.counts)
         return found.with_uncertain_poses(ranges_m.astype(np.float32), config)
 
     @classmethod
     def of_means(cls, means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> "ReturnsOfCells":
         """Weigh the mean ray of each leaf cell, whose returns have nearly the same range if seen from the same position."""
-        weights = weights_of(means.counts, means.ranges_m, noise)
-        found = cls(means.keys, *weights, means.scans, means.counts.astype(np.float64))
+        information = means.counts / noise.variances_m2(means.ranges_m)
+        found = cls(means.keys, information, means.scans, means.counts.astype(np.float64))
         return found.with_uncertain_poses(means.ranges_m, config)
 
     def select(self, part: Bools) -> "ReturnsOfCells":

@@ -8,7 +8,7 @@ the number of returns there nor the rays of other returns reveal that they are f
 import numpy as np
 
 from radarsdf._core import SurfelMap
-from radarsdf.arrays import Bools, Floats, Ints, Ints32
+from radarsdf.arrays import Bools, Ints, Ints32
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
@@ -39,27 +39,23 @@ def find_ghosts(
     sampled first, every fourth: the others of a block of 4 × 4 × 4 cells are followed only if one of the sample crosses a
     surface, or the sample is too small to exclude ghosts.
     """
-    weights = rays.counts if isinstance(rays, MeanRays) else None
-
-    def count(rows: Ints32, of: Bools, size: int) -> Floats:
-        return np.bincount(rows[of], None if weights is None else weights[of], size).astype(np.float64)
-
+    weights = rays.counts if isinstance(rays, MeanRays) else np.ones(len(rays), np.float32)
     flat = np.flatnonzero(surfels.is_flat())
     if isinstance(rays, MeanRays):
         first = _first_crossed_near_sample(surfels, flat, rays, cell_of_ray, noise, num_threads)
     else:
         first = first_crossed(surfels, flat, rays, noise, num_threads)
-    passed = np.zeros(len(surfels.keys))
-    passed[surfels.cell_of_plane[flat]] = count(first, first >= 0, len(flat))
+    crossing = np.flatnonzero(first >= 0)
+    cells, passed = surfels.cell_of_plane[flat], np.zeros(len(surfels.keys))
+    passed[cells] = np.bincount(first[crossing], weights[crossing], len(flat))
     # Ghosts lie behind surfaces that stop most rays.
-    cells = surfels.cell_of_plane[flat]
     keys = surfels.keys[cells]
     passed_near = surfels.blocks.neighbour_sums(keys, passed[:, None], NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     opaque = flat[surfels.support[cells] / (surfels.support[cells] + passed_near) > _MIN_OPACITY]
-    behind, crossing = first >= 0, np.flatnonzero(first >= 0)
     crossed = first_crossed(surfels, opaque, rays.select(crossing), noise, num_threads, beyond_returns=False)
-    behind[crossing] = crossed >= 0
-    columns = np.stack([count(cell_of_ray, behind, len(surfels.keys)), surfels.counts], 1)
+    behind = crossing[crossed >= 0]
+    counts_behind = np.bincount(cell_of_ray[behind], weights[behind], len(surfels.keys))
+    columns = np.stack([counts_behind, surfels.counts], 1)
     sums = surfels.blocks.neighbour_sums(surfels.keys, columns, 1.0, num_threads)
     return sums[:, 0] > _MIN_SHARE * sums[:, 1]
 

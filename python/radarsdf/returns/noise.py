@@ -187,9 +187,9 @@ def _shares(rays: Rays, rows: Ints, normals: Floats) -> Floats:
     ranges2 = np.square(rays.ranges_m.take(rows).astype(np.float64))
     up, normal = rays.up_of_scan.take(rays.scans.take(rows), axis=0).T, normals.T
     along = rays.directions.take(rows, axis=0).T.astype(np.float64)
-    azimuth = _cross(up, along)  # direction of increasing azimuth
+    azimuth = np.cross(up, along, axis=0)  # direction of increasing azimuth
     azimuth /= np.maximum(np.sqrt(_dot(azimuth, azimuth)), _MIN_SINE)
-    elevation = _cross(along, azimuth)
+    elevation = np.cross(along, azimuth, axis=0)
     shares = [np.square(_dot(axis, normal)) for axis in (along, azimuth, elevation)]
     return np.stack([shares[0], shares[1] * ranges2, shares[2] * ranges2])
 
@@ -199,10 +199,6 @@ def _shares(rays: Rays, rows: Ints, normals: Floats) -> Floats:
 
 def _dot(a: Floats, b: Floats) -> Floats:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    return np.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
 
 
 def onto_surfels(

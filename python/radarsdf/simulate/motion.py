@@ -318,11 +318,8 @@ def simulate_rig(
     scans = Scans(points, body, values, doppler_mps=doppler_mps, times_s=stamps_s, **of_radars)
     scans = scans.select(np.argsort(stamps_s, kind="stable"))
     lidars = [simulation.lidar for simulation in simulations.values()]
-
-    def truth() -> Floats:
-        return np.concatenate([lidar.points for lidar in lidars])
-
-    return SimulatedRig(scans.with_ground_truth(truth), simulations)
+    truth = scans.with_ground_truth(lambda: np.concatenate([lidar.points for lidar in lidars]))
+    return SimulatedRig(truth, simulations)
 
 
 def _scan_times(radar: MountedRadar, at_s: Floats) -> Floats:
