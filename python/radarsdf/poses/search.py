@@ -201,9 +201,9 @@ class SurfaceIndex:
         return np.isfinite(self._tree.query(points, distance_upper_bound=reach_m)[0])
 
     def outlines(self, points: Floats, margin_m: float) -> Bools:
-        """Return a mask of points (..., 3) that are, seen from above, within the convex outline of the map."""
+        """Return a mask (N,) of points (N, 3) that are, seen from above, within the convex outline of the map."""
         edges = self._outline
-        return (points[..., :2] @ edges[:, :2].T + edges[:, 2] <= margin_m).all(axis=-1)
+        return np.asarray((points[:, :2] @ edges[:, :2].T + edges[:, 2] <= margin_m).all(axis=1))
 
     @cached_property
     def _outline(self) -> Floats:
