@@ -89,12 +89,6 @@ class GradientBackend(ABC):
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
         """Return gradients of `losses`, and the result of `meanwhile`, which the calling thread runs while others work."""
 
-    def state(self) -> dict[str, Tensor]:
-        return {"generator": self._generator.get_state()}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        self._generator.set_state(state["generator"])
-
     def _draw_dropouts(self) -> list[tuple[int, Dropout]]:
         """Draw the dropout of each part of the encoding, with its width, for the intensity network alone."""
         if not self._config.networks.dropout or self._dropout_scale == 0:

@@ -82,17 +82,15 @@ class RaySampler:
         self._layouts: dict[tuple[int, ...], _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
-        """Return the order of the rays, as a generator state, and the position in it: -1 before the first batch."""
-        following = self._next if len(self._runs) else -1
-        following_ray = torch.tensor(following, dtype=torch.int64, device="cpu")
-        return {"order_from": self._order_from, "next": following_ray}
+        """Return the order of the rays, as a generator state, and the position in it: 0 before an order is drawn."""
+        following = torch.tensor(self._next, dtype=torch.int64, device="cpu")
+        return {"order_from": self._order_from, "next": following}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        following = int(state["next"])
-        fits = -1 <= following <= len(self._rays) + self._neighbours
+    def restore(self, order_from: Tensor, following: int) -> None:
+        fits = 0 <= following <= len(self._rays) + self._neighbours
         check(fits, f"a sampler of {len(self._rays)} rays cannot be at ray {following}")
-        if following >= 0:
-            self._generator.set_state(state["order_from"])
+        if following > 0:
+            self._generator.set_state(order_from)
             self._draw_order()
             self._next = following
 

@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -123,10 +123,6 @@ class LossHistory:
     def state(self) -> dict[str, Tensor]:
         return {name: torch.from_numpy(a) for name, a in (*self._spans.items(), ("recent", self._recent))}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        for name, tensor in self.state().items():
-            tensor.copy_(state[name])
-
 
 @dataclass(frozen=True)
 class _Stage:
@@ -134,7 +130,7 @@ class _Stage:
     losses: Losses
     iterations: int
     joint: int  # iterations of the sdf stage that train the intensity network, too, evenly spread
-    optimisers: list[Optimiser]  # optimisers of the trained parameters, in the order of their gradients
+    optimisers: dict[str, Optimiser]  # optimisers of the trained parameters, in the order of their gradients
     rows: RowAdam | None  # optimiser of the features if only touched rows move
     draw: Callable[[], Batch]
 
@@ -170,8 +166,8 @@ class Training:
         network, training = field.intensity_network, config.training
         kind = AutogradGradients if network is not None and config.networks.normals else CoreGradients
         seeds = (config.seed * _GENERATORS + i for i in range(_GENERATORS))
-        self._generator, of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
-        self._backend = kind(field, config, schedule.dropout_scale, of_dropout, pool)
+        self._generator, self._of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
+        self._backend = kind(field, config, schedule.dropout_scale, self._of_dropout, pool)
         self._scale = None if network is None else scale
         # A sampler copies the rays, so only one exists at a time.
         self._sampler = self._sampler_of(surface)
@@ -206,20 +202,18 @@ class Training:
         state = {
             "done": torch.tensor(list(self.iterations_done.values()), dtype=torch.int64, device="cpu"),
             "losses": torch.tensor(losses, dtype=torch.float64, device="cpu"),
-            "of_all_returns": torch.tensor(self._later is None, dtype=torch.int64, device="cpu"),
             "generator": self._generator.get_state(),
+            "backend.generator": self._of_dropout.get_state(),
         }
-        state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
-        for name, part in self._parts():
-            state |= {f"{name}.{key}": value for key, value in part.state().items()}
-        return state
+        state |= {f"sampler.{key}": value for key, value in self._sampler.state().items()}
+        return state | self._tensors()
 
-    def _parts(self) -> Iterable[tuple[str, Any]]:
-        yield from (("history", self.history), ("backend", self._backend), ("sampler", self._sampler))
-        if self._rows is not None:
-            yield "rows", self._rows
-        for name, optimiser in self._optimisers.items():
-            yield f"optimiser.{name}", optimiser
+    def _tensors(self) -> dict[str, Tensor]:
+        """Return the part of the state that is updated in place."""
+        parts: dict[str, Any] = {f"optimiser.{name}": own for name, own in self._optimisers.items()}
+        parts |= {"history": self.history} | ({} if self._rows is None else {"rows": self._rows})
+        tensors = {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
+        return tensors | {f"{name}.{k}": v for name, own in parts.items() for k, v in own.state().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restore a :meth:`state` of the same fit. Raise a ValueError if it is invalid."""
@@ -229,14 +223,15 @@ class Training:
         self.iterations_done.update(done)
         losses = zip(done, state["losses"].tolist(), strict=True)
         self.losses.update({name: loss for name, loss in losses if done[name]})
-        for name, parameter in self._field.named_parameters():
-            parameter.data.copy_(state[f"field.{name}"])
-        if state["of_all_returns"]:
+        for name, tensor in self._tensors().items():
+            tensor.copy_(state[name])
+        if self._rows is not None:
+            self._rows.check_state(done["sdf"])
+        if done["intensity"] > self._schedule.joint_iterations:
             self._draw_from_all_returns()
-        for name, part in self._parts():
-            own = {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")}
-            part.restore(own)
+        self._sampler.restore(state["sampler.order_from"], int(state["sampler.next"]))
         self._generator.set_state(state["generator"])  # last, because the sampler changes it
+        self._of_dropout.set_state(state["backend.generator"])
 
     def report(self) -> dict[str, Any]:
         names = ("iterations", "iterations_done", "losses")
@@ -267,13 +262,13 @@ class Training:
 
     def _stages(self) -> list[_Stage]:
         joint = "intensity" in self._optimisers
-        optimisers, shared = list(self._optimisers.values()), self._schedule.joint_iterations
+        optimisers, shared = self._optimisers, self._schedule.joint_iterations
         losses: Losses = "joint" if joint else "sdf"
         stages = [_Stage("sdf", losses, self.iterations["sdf"], shared, optimisers, self._rows, self._batch)]
         left = self.iterations["intensity"] - shared
         if joint and left > 0:
-            draw = self._labelled_batch
-            stages.append(_Stage("intensity", "intensity", left, shared, optimisers[-1:], None, draw))
+            own, draw = {"intensity": optimisers["intensity"]}, self._labelled_batch
+            stages.append(_Stage("intensity", "intensity", left, shared, own, None, draw))
         return stages
 
     def _batch(self) -> Batch:
@@ -294,7 +289,7 @@ class Training:
         self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
     ) -> None:
         rows, iterations = stage.rows, stage.iterations
-        changing = [p for optimiser in stage.optimisers for p in optimiser.parameters]
+        changing = [p for optimiser in stage.optimisers.values() for p in optimiser.parameters]
         if rows is not None:
             changing.append(self._field.cells.features)
         every = max(_CHECK_EVERY, sum(map(len, changing)) // _ROWS_PER_ITERATION)
@@ -325,14 +320,13 @@ class Training:
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
-            moved = stage.optimisers if trains_all else stage.optimisers[:-1]
-            move_networks = functools.partial(_move_networks, found, moved, share)
+            moved = {n: own for n, own in stage.optimisers.items() if trains_all or n != "intensity"}
+            move_networks = functools.partial(_move_networks, found, moved, done, share)
             if rows is None:
                 move_networks(self._pool)
             else:
                 assert found.touched is not None
-                rows.learning_rate = share * rows.full_rate
-                rows.step(found.touched, self._pool, meanwhile=move_networks)
+                rows.step(found.touched, done["sdf"], share, self._pool, meanwhile=move_networks)
             self.losses[stage.name] = loss
             for name, count in done.items():
                 self.iterations_done[name] = min(count, self.iterations[name])
@@ -356,9 +350,13 @@ class Training:
 
 
 def _move_networks(
-    found: Gradients, optimisers: list[Optimiser], share: float, pool: ThreadPool | None = None
+    found: Gradients,
+    optimisers: dict[str, Optimiser],
+    done: dict[str, int],
+    share: float,
+    pool: ThreadPool | None = None,
 ) -> None:
     total = iter(found.by_parameters)
-    for optimiser in optimisers:
-        optimiser.learning_rate = share * optimiser.full_rate
-        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))), pool)
+    for name, optimiser in optimisers.items():
+        own = list(itertools.islice(total, len(optimiser.parameters)))
+        optimiser.step(own, done[name if name in done else "sdf"], share, pool)
