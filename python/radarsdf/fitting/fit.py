@@ -144,7 +144,7 @@ class FitInput:
     scale: IntensityScale | None  # scale of their intensities
     poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans, used to estimate the `sensor`
     moving: int = 0  # number of moving returns left out
-    why_none_moving: str | None = None  # see :class:`radarsdf.returns.moving.MovingReturns`
+    why_none_moving: str | None = None  # why Doppler was not used, in words
     inside: Bools | None = None
     """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
     clutter_ratio: float | None = None  # share of the returns not on a thin surface

@@ -58,15 +58,6 @@ class Evidence:
         return np.stack([self.information, self.hits, self.visibility, usual], 1, dtype=np.float32)
 
 
-def weights_of(counts: Floats32, ranges_m: Floats32, noise: SensorNoise) -> tuple[Floats32, Floats32]:
-    """Return the weights of groups of `counts` (M,) returns with about the same range (M,), m.
-
-    The first is their weight in averages of distances, relative to that of one return. The second, in smoothing, evidence and
-    uncertainty, is 1 / variance of the position, m⁻².
-    """
-    return counts, counts / noise.variances_m2(ranges_m)
-
-
 @dataclass(frozen=True)
 class ReturnsOfCells:
     """Weights, number of scans and number of returns of each leaf cell, in the order of the keys."""
@@ -86,7 +77,7 @@ class ReturnsOfCells:
         parts = noise.weights(rays)
         ones: Floats32 = np.broadcast_to(np.float32(1), len(rays))
         ones = ones if parts is None else (parts / WEIGHT_UNIT).astype(np.float32)
-        of_rays = weights_of(ones, rays.ranges_m, noise)
+        of_rays = ones, ones / noise.variances_m2(rays.ranges_m)
         sums = [np.bincount(cells.cell_of_ray, values, len(cells.keys)) for values in of_rays]
         weights, information = (values.astype(np.float32) for values in sums)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
@@ -97,8 +88,8 @@ class ReturnsOfCells:
     @classmethod
     def of_means(cls, means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> "ReturnsOfCells":
         """Weigh the mean ray of each leaf cell, whose returns have nearly the same range if seen from the same position."""
-        weights = weights_of(means.counts, means.ranges_m, noise)
-        found = cls(means.keys, *weights, means.scans, means.counts.astype(np.float64))
+        information = means.counts / noise.variances_m2(means.ranges_m)
+        found = cls(means.keys, means.counts, information, means.scans, means.counts.astype(np.float64))
         return found.with_uncertain_poses(means.ranges_m, config)
 
     def select(self, part: Bools) -> "ReturnsOfCells":

@@ -252,7 +252,7 @@ class Reflectance:
     network_share: float = 0.0  # factor on the intensity network's prediction, to which this is added
 
     @cached_property
-    def _response(self) -> Response:
+    def response(self) -> Response:
         return Response(self.coefficients, self.table)
 
     @cached_property
@@ -320,10 +320,6 @@ class Reflectance:
             share,
         )
 
-    def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
-        """See :meth:`~radarsdf.returns.reflectance.Response.measured`."""
-        return self._response.measured(directions, ranges_m)
-
     def at(
         self, points: Floats32, directions: Floats32, ranges_m: Floats32, num_threads: int = 0
     ) -> Floats32:
@@ -334,7 +330,7 @@ class Reflectance:
         directions = np.ascontiguousarray(directions)
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
         incidence = _incidence(self.normals, rows, directions)
-        found = self._response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
+        found = self.response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
         found += self._cells.sums(near, directions, incidence, num_threads)
         return found
 

@@ -214,20 +214,15 @@ class Radars:
     """(K,) of each, relative to the first that measures intensities. None: it shares no surface with others."""
 
     @classmethod
-    def of(cls, rays: Rays, labels: tuple[Label, ...], config: FitConfig, num_threads: int = 0) -> "Radars":
-        """Estimate from `rays` of all radars."""
-        surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
-        noise = rig_noise(surfels, rays, config.returns, num_threads)
-        return cls(labels, noise, intensity_units(surfels, rays, num_threads))
-
-    @classmethod
     def unify(
         cls, rays: Rays, rig: Rig | None, config: FitConfig, num_threads: int = 0
     ) -> "tuple[Rays, Radars | None]":
         """Estimate the radars of a rig, and return `rays` in one unit, and them; of one radar as they are, and None."""
         if rig is None:
             return rays, None
-        radars = cls.of(rays, rig.labels, config, num_threads)
+        surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
+        noise = rig_noise(surfels, rays, config.returns, num_threads)
+        radars = cls(rig.labels, noise, intensity_units(surfels, rays, num_threads))
         return radars.in_one_unit(rays), radars
 
     def in_one_unit(self, rays: Rays) -> Rays:
