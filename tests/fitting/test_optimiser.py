@@ -5,7 +5,7 @@ import pytest
 import torch
 from radarsdf._core import CellSet, Encoding
 from radarsdf.field import kernels
-from radarsdf.field.neural_field import VertexFeatures
+from radarsdf.field.field import VertexFeatures
 from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
 from radarsdf.threads import ThreadPool
 

@@ -13,7 +13,7 @@ from radarsdf._core import FEATURE_DIM, CellSet
 from radarsdf.arrays import Bools
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
+from radarsdf.field.field import intensity_widths, sdf_widths, weights_of
 from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_BAND_CELLS, NEAR_SAMPLES, seen_jointly
 from radarsdf.fitting.surface_returns import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.memory import available_bytes

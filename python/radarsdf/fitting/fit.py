@@ -14,8 +14,7 @@ from radarsdf._core import cell_keys, stable_order
 from radarsdf.arrays import Bools, Floats32, Ints
 from radarsdf.checks import AnyPath, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.field import Field
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import Field, NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule, check_extent, check_fit, skipped_parts
 from radarsdf.fitting.surface_returns import SurfaceReturns, average_surface, occupied_cells

@@ -19,7 +19,7 @@ from radarsdf import _core
 from radarsdf.arrays import Array, Ints32
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field import kernels
-from radarsdf.field.neural_field import NeuralField, cells_width, fourier_width
+from radarsdf.field.field import NeuralField, cells_width, fourier_width
 from radarsdf.fitting.sampling import Batch, Dropout
 from radarsdf.threads import ThreadPool
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.checks import check
+from radarsdf.field.field import VertexFeatures
 from radarsdf.field.kernels import large_zeros, view
-from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import ThreadPool
 

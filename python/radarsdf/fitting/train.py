@@ -16,7 +16,7 @@ from tqdm import tqdm
 from radarsdf.arrays import Array
 from radarsdf.checks import check, hides_bar
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, Losses
