@@ -210,7 +210,7 @@ class NeuralField(Field):
 
     def geometry(self, points: Tensor, *, frozen: bool = True) -> Geometry:
         """Return the inputs of the intensity network at points (N, 3), local, m. `frozen`: detach features and SDF network."""
-        wants_normals = self.intensity_network is not None and self.intensity_network.normals
+        wants_normals = self.intensity_network is not None and self.intensity_network.sees.normals
         # A normal is the gradient of the logit: it needs an autograd graph even if the field is frozen.
         with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
             if wants_normals:
@@ -292,20 +292,17 @@ class IntensityNetwork(Network):
 
     def __init__(self, config: FitConfig) -> None:
         super().__init__(intensity_widths(config))
-        networks = config.networks
-        self.view_direction = networks.view_direction
-        self.log_range = networks.log_range
-        self.normals = networks.normals
+        self.sees = config.networks
 
     def forward(self, geometry: Geometry, directions: Tensor, ranges_m: Tensor) -> Tensor:
         """Return scaled intensities (N,) along unit vectors (N, 3) from ranges (N,), m."""
         inputs = [*geometry.encoding, geometry.feature, geometry.logit[:, None]]
-        if self.normals:
+        if self.sees.normals:
             assert geometry.normals is not None
             inputs.append(geometry.normals)
-        if self.view_direction:
+        if self.sees.view_direction:
             inputs.append(kernels.spherical_harmonics(directions))
-        if self.log_range:
+        if self.sees.log_range:
             inputs.append(torch.log10(ranges_m.clamp_min(1e-3) / 10.0)[:, None])
         return self._run(inputs).squeeze(1)
 

@@ -201,9 +201,6 @@ def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequ
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
     """Return real spherical harmonics (N, 16) of degree 0 to 3 of unit vectors (N, 3). Not differentiable."""
-    if directions.requires_grad:
-        msg = "spherical_harmonics has no gradient with respect to the directions"
-        raise NotImplementedError(msg)
     out = directions.new_empty((directions.shape[0], NUM_SPHERICAL_HARMONICS))
     _core.spherical_harmonics(view(directions), out.numpy(), threads())
     return out

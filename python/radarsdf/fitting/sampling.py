@@ -66,7 +66,7 @@ class RaySampler:
         batch_size: int,
         generator: torch.Generator,
         neighbours: int = 1,
-        intensities: Tensor | None = None,
+        intensities: Floats32 | None = None,
         num_threads: int = 1,
     ) -> None:
         self._config = config
@@ -138,13 +138,13 @@ class RaySampler:
         return Batch(*_core.draw_samples(self._rays, places, *of_samples, seed), layout.parts)
 
 
-def _in_morton_order(rays: Rays, values: Tensor | None, leaf_size_m: float, num_threads: int) -> Floats32:
+def _in_morton_order(rays: Rays, values: Floats32 | None, leaf_size_m: float, num_threads: int) -> Floats32:
     """Return :attr:`Batch.of_ray` for all rays, in Morton order of their returns."""
     # A ray is one row of 32 bytes, half a cache line: a batch reads it by one gather.
     order = _core.stable_order(_core.cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
     if values is not None:
-        columns.append(values.numpy()[:, None])
+        columns.append(values[:, None])
     rows = np.empty((len(rays), sum(column.shape[1] for column in columns)), np.float32)
     _core.gather_rows([np.ascontiguousarray(column) for column in columns], order, rows, num_threads)
     return rows

@@ -131,7 +131,6 @@ class _Stage:
     iterations: int
     joint: int  # iterations of the sdf stage that train the intensity network, too, evenly spread
     optimisers: dict[str, Optimiser]  # optimisers of the trained parameters, in the order of their gradients
-    rows: RowAdam | None  # optimiser of the features if only touched rows move
     draw: Callable[[], Batch]
 
     def done(self, count: int) -> dict[str, int]:
@@ -187,7 +186,7 @@ class Training:
     def _sampler_of(self, rays: Rays) -> RaySampler:
         unit = None
         if self._scale is not None and rays.intensities is not None:
-            unit = torch.from_numpy(self._scale.to_unit(rays.intensities))
+            unit = self._scale.to_unit(rays.intensities)
         size, neighbours = self._schedule.batch_size, self._schedule.neighbours
         return RaySampler(rays, self._config, size, self._generator, neighbours, unit, self._pool.num_threads)
 
@@ -264,11 +263,11 @@ class Training:
         joint = "intensity" in self._optimisers
         optimisers, shared = self._optimisers, self._schedule.joint_iterations
         losses: Losses = "joint" if joint else "sdf"
-        stages = [_Stage("sdf", losses, self.iterations["sdf"], shared, optimisers, self._rows, self._batch)]
+        stages = [_Stage("sdf", losses, self.iterations["sdf"], shared, optimisers, self._batch)]
         left = self.iterations["intensity"] - shared
         if joint and left > 0:
             own, draw = {"intensity": optimisers["intensity"]}, self._labelled_batch
-            stages.append(_Stage("intensity", "intensity", left, shared, own, None, draw))
+            stages.append(_Stage("intensity", "intensity", left, shared, own, draw))
         return stages
 
     def _batch(self) -> Batch:
@@ -288,7 +287,7 @@ class Training:
     def _run_stage(
         self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
     ) -> None:
-        rows, iterations = stage.rows, stage.iterations
+        rows, iterations = self._rows if stage.name == "sdf" else None, stage.iterations
         changing = [p for optimiser in stage.optimisers.values() for p in optimiser.parameters]
         if rows is not None:
             changing.append(self._field.cells.features)
