@@ -7,6 +7,7 @@ An operator could also get the vertex table only through a global registry.
 The core gets tensors as NumPy views of the same memory. Results are bit-identical with any number of threads.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -127,24 +128,16 @@ class _InterpolateBackward(torch.autograd.Function):
         g, features, points, located = ctx.saved_tensors
         table = ctx.table
         needs_g, needs_features, needs_points = ctx.needs_input_grad[:3]
-
-        def total(*terms: Tensor | None) -> Tensor | None:
-            present = [term for term in terms if term is not None]
-            return sum(present[1:], present[0]) if present else None
-
+        of_each = ([] if a is None else [(a, None)]) + ([] if v is None else [(features, v)])
         g_grad = features_grad = points_grad = None
-        if needs_g:
-            g_grad = total(
-                None if a is None else _interpolate(table, a, points, located, None),
-                None if v is None else _interpolate(table, features, points, located, v),
-            )
+        if needs_g and of_each:
+            terms = (_interpolate(table, f, points, located, along) for f, along in of_each)
+            g_grad = functools.reduce(torch.add, terms)
         if needs_features and v is not None:
             features_grad = scatter(table, points, located, v, g)
-        if needs_points:
-            points_grad = total(
-                None if a is None else _coordinate_gradient(table, a, points, located, None, g),
-                None if v is None else _coordinate_gradient(table, features, points, located, v, g),
-            )
+        if needs_points and of_each:
+            terms = (_coordinate_gradient(table, f, points, located, along, g) for f, along in of_each)
+            points_grad = functools.reduce(torch.add, terms)
         return g_grad, features_grad, points_grad, None, None, None, None
 
 
