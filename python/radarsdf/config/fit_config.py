@@ -218,10 +218,8 @@ class FitConfig:
 
 def settings_of_results(config: FitConfig) -> dict[str, Any]:
     """Return :meth:`FitConfig.to_dict` without the settings that affect no result: two fits that agree in these are equal."""
-    settings = config.to_dict()
-    for name in ("num_threads", "max_memory_bytes"):
-        del settings[name]
-    return settings
+    without = ("num_threads", "max_memory_bytes")
+    return {name: value for name, value in config.to_dict().items() if name not in without}
 
 
 def flat_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -250,27 +248,16 @@ def to_toml(config: FitConfig) -> str:
 
     A setting that is None is written as a comment, because TOML has no null.
     """
-    top, tables = [], []
-    for name, value, description in _settings(config):
-        if not dataclasses.is_dataclass(value):
-            top += _lines(name, value, description)
-            continue
-        tables += ["", f"[{name}]", *_comment(description), ""]
-        for setting in _settings(value):
-            tables += _lines(*setting)
-    return "\n".join(top + tables) + "\n"
+    return "\n".join(_lines(config)) + "\n"
 
 
-def _settings(group: Any) -> list[tuple[str, Any, str]]:
-    described = {name: field.description or "" for name, field in group.__pydantic_fields__.items()}
-    return [(name, getattr(group, name), " ".join(text.split())) for name, text in described.items()]
-
-
-def _lines(name: str, value: Any, description: str) -> list[str]:
-    # TOML writes numbers, strings, booleans and lists as JSON does.
-    written = f"# {name} =" if value is None else f"{name} = {json.dumps(value)}"
-    return [*_comment(description), written]
-
-
-def _comment(text: str) -> list[str]:
-    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+def _lines(group: Any) -> list[str]:
+    top, tables = list[str](), list[str]()
+    for name, field in group.__pydantic_fields__.items():
+        value, text = getattr(group, name), " ".join((field.description or "").split())
+        comment = textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+        if dataclasses.is_dataclass(value):
+            tables += ["", f"[{name}]", *comment, "", *_lines(value)]
+        else:  # TOML writes numbers, strings, booleans and lists as JSON does
+            top += [*comment, f"# {name} =" if value is None else f"{name} = {json.dumps(value)}"]
+    return top + tables
