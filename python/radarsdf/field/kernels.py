@@ -215,10 +215,14 @@ class _MLP(torch.autograd.Function):
     # `tensors`: weight and bias of each layer, then the inputs.
     @staticmethod
     def forward(ctx: Any, num_layers: int, *tensors: Tensor) -> Tensor:
-        inputs = tensors[2 * num_layers :]
-        out = inputs[0].new_empty((inputs[0].shape[0], tensors[2 * num_layers - 1].shape[0]))
+        layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
+        out = inputs[0].new_empty((inputs[0].shape[0], layers[-1].shape[0]))
         keep = any(ctx.needs_input_grad)
-        views = _views(num_layers, tensors)
+        views = (
+            [rows_view(x) for x in inputs],
+            [view(w) for w in layers[::2]],
+            [view(b) for b in layers[1::2]],
+        )
         ctx.hidden = _core.mlp(*views, out.numpy(), keep, threads())
         ctx.views = views
         ctx.save_for_backward(*tensors)
@@ -248,12 +252,6 @@ class _MLP(torch.autograd.Function):
             *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
         )
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
-
-
-def _views(num_layers: int, tensors: Sequence[Tensor]) -> tuple[list[Any], list[Any], list[Any]]:
-    """Return inputs, weights and biases as views for the core."""
-    layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
-    return [rows_view(x) for x in inputs], [view(w) for w in layers[::2]], [view(b) for b in layers[1::2]]
 
 
 def _plain(num_layers: int, tensors: Sequence[Tensor]) -> Tensor:

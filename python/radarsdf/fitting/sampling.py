@@ -34,11 +34,6 @@ def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
     return near, near if training.intensity_in_free_space else min(near, training.intensity_batch_size)
 
 
-def seen_jointly(config: FitConfig, batch_size: int) -> int:
-    """Return the number of samples of a batch that the intensity network sees in a joint iteration."""
-    return batch_size if config.training.intensity_in_free_space else near_and_labelled(config, batch_size)[1]
-
-
 @dataclass(frozen=True)
 class Batch:
     """B samples on rays, in consecutive parts, each with the samples near the surface first. One thread processes each part."""
