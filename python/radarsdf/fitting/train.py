@@ -127,17 +127,19 @@ class LossHistory:
 @dataclass(frozen=True)
 class _Stage:
     name: str
-    losses: Losses
     iterations: int
     joint: int  # iterations of the sdf stage that train the intensity network, too, evenly spread
-    optimisers: dict[str, Optimiser]  # optimisers of the trained parameters, in the order of their gradients
-    draw: Callable[[], Batch]
 
     def done(self, count: int) -> dict[str, int]:
         """Return how often each loss was trained after `count` iterations of this stage."""
         if self.name == "sdf":
             return {"sdf": count, "intensity": count * self.joint // self.iterations}
         return {"intensity": self.joint + count}
+
+    def losses(self, i: int) -> Losses:
+        if self.name == "intensity":
+            return "intensity"
+        return "joint" if self.done(i + 1)["intensity"] > self.done(i)["intensity"] else "sdf"
 
 
 class Training:
@@ -242,7 +244,9 @@ class Training:
         Raises :class:`Diverged`, with the field reset to the last parameters that passed the check; or after Ctrl-C a
         KeyboardInterrupt, between two iterations.
         """
-        stages = self._stages()
+        shared = self._schedule.joint_iterations
+        lengths = {"sdf": self.iterations["sdf"], "intensity": self.iterations["intensity"] - shared}
+        stages = [_Stage(name, length, shared) for name, length in lengths.items() if length > 0]
         self.history.start()
         total, done = sum(stage.iterations for stage in stages), sum(map(self._done, stages))
         with (
@@ -258,17 +262,6 @@ class Training:
                 checkpoint.write(self.state())
             if interrupted():  # the training is done, but the program that called the fit should stop too
                 raise KeyboardInterrupt
-
-    def _stages(self) -> list[_Stage]:
-        joint = "intensity" in self._optimisers
-        optimisers, shared = self._optimisers, self._schedule.joint_iterations
-        losses: Losses = "joint" if joint else "sdf"
-        stages = [_Stage("sdf", losses, self.iterations["sdf"], shared, optimisers, self._batch)]
-        left = self.iterations["intensity"] - shared
-        if joint and left > 0:
-            own, draw = {"intensity": optimisers["intensity"]}, self._labelled_batch
-            stages.append(_Stage("intensity", "intensity", left, shared, own, draw))
-        return stages
 
     def _batch(self) -> Batch:
         return self._sampler.batch(self._backend.num_parts(self._schedule.batch_size))
@@ -287,8 +280,10 @@ class Training:
     def _run_stage(
         self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
     ) -> None:
-        rows, iterations = self._rows if stage.name == "sdf" else None, stage.iterations
-        changing = [p for optimiser in stage.optimisers.values() for p in optimiser.parameters]
+        first, iterations = stage.name == "sdf", stage.iterations
+        rows, draw = (self._rows, self._batch) if first else (None, self._labelled_batch)
+        optimisers = self._optimisers if first else {"intensity": self._optimisers["intensity"]}
+        changing = [p for optimiser in optimisers.values() for p in optimiser.parameters]
         if rows is not None:
             changing.append(self._field.cells.features)
         every = max(_CHECK_EVERY, sum(map(len, changing)) // _ROWS_PER_ITERATION)
@@ -310,16 +305,14 @@ class Training:
             judge = i % every == every - 1 or i == iterations - 1
             pause = stop or write or judge
             # Samples are not prefetched before the state is written: it would include their draw.
-            batch = ahead or stage.draw()
-            done = stage.done(i + 1)
-            trains_all = stage.losses != "joint" or done["intensity"] > stage.done(i)["intensity"]
-            losses = stage.losses if trains_all else "sdf"
-            found, ahead = self._backend.of(losses, batch, (lambda: None) if pause else stage.draw)
+            batch = ahead or draw()
+            done, losses = stage.done(i + 1), stage.losses(i)
+            found, ahead = self._backend.of(losses, batch, (lambda: None) if pause else draw)
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
-            moved = {n: own for n, own in stage.optimisers.items() if trains_all or n != "intensity"}
+            moved = {name: own for name, own in optimisers.items() if losses != "sdf" or name != "intensity"}
             move_networks = functools.partial(_move_networks, found, moved, done, share)
             if rows is None:
                 move_networks(self._pool)
