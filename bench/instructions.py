@@ -22,7 +22,7 @@ import numpy as np
 import radarsdf
 import torch
 from radarsdf import FitConfig, _core
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import NeuralField
 from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.surface_returns import near_leaf_keys
 from radarsdf.fitting.train import Training

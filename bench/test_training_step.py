@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import NeuralField
 from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_SAMPLES
 from radarsdf.fitting.surface_returns import near_leaf_keys

@@ -11,7 +11,7 @@ import radarsdf
 import torch
 import trimesh
 from radarsdf import FitConfig
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.surface_returns import near_leaf_keys

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig, _core
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import NeuralField
 from radarsdf.fitting.gradients import AutogradGradients, CoreGradients
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.surface_returns import near_leaf_keys

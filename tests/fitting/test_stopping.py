@@ -151,12 +151,12 @@ def poisoned(monkeypatch):
     def at(n):
         count = 0
 
-        def poisoned_step(adam, gradients):
+        def poisoned_step(adam, gradients, *others):
             nonlocal count
             count += 1
             if count == n:
                 gradients[0].view(-1)[0] = math.nan
-            step(adam, gradients)
+            step(adam, gradients, *others)
 
         monkeypatch.setattr(Adam, "step", poisoned_step)
 

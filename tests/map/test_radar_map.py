@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import NeuralField
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 

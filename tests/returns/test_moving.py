@@ -6,9 +6,9 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.returns.moving import (
-    MovingReturns,
     StaticReturns,
     folding_interval_mps,
+    moving_returns,
     sensor_velocity,
     without_filler,
 )
@@ -34,20 +34,24 @@ def drive():
     return scans, doppler, moves
 
 
+def static(points, doppler):
+    return StaticReturns.of(points, None, doppler, FitConfig().returns)
+
+
 def test_moving_returns_are_found(drive):
     scans, doppler, moves = drive
     for sign in (1, -1):  # the sign differs between sensors
-        found = MovingReturns.of(scans.points, [sign * values for values in doppler])
-        assert found.why_none is None
-        found_moving, true = np.concatenate(found.masks), np.concatenate(moves)
+        masks, why_none = moving_returns(scans.points, [sign * values for values in doppler])
+        assert why_none is None
+        found_moving, true = np.concatenate(masks), np.concatenate(moves)
         assert found_moving[true].mean() > 0.99
         assert found_moving[~true].mean() < 0.01
-        assert found.count == found_moving.sum()
+        assert static(scans.points, [sign * values for values in doppler]).moving == found_moving.sum()
 
 
 def test_a_fit_excludes_and_counts_moving_returns(drive):
     scans, doppler, _ = drive
-    expected = MovingReturns.of(scans.points, doppler).count
+    expected = static(scans.points, doppler).moving
     for given in (
         {"points": Scans(scans.points, scans.poses, scans.intensities, doppler_mps=doppler)},
         {
@@ -71,22 +75,22 @@ def test_half_of_the_scans_must_agree_on_a_velocity(drive):
     scans, doppler, _ = drive
     rng = np.random.default_rng(2)
     noise = [rng.uniform(-20, 20, len(v)) for v in doppler]
-    expected = MovingReturns.of(scans.points, doppler).masks
-    found = MovingReturns.of(scans.points, doppler[:6] + noise[6:])
-    assert found.why_none is None
-    for mask, agreeing in zip(found.masks[:6], expected, strict=False):
+    expected, _ = moving_returns(scans.points, doppler)
+    found, why_none = moving_returns(scans.points, doppler[:6] + noise[6:])
+    assert why_none is None
+    for mask, agreeing in zip(found[:6], expected, strict=False):
         np.testing.assert_array_equal(mask, agreeing)
-    assert not np.concatenate(found.masks[6:]).any()
+    assert not np.concatenate(found[6:]).any()
     # Scans of less than ten returns do not count.
     points = [*scans.points[:11], scans.points[11][:9]]
-    assert MovingReturns.of(points, [*doppler[:6], *noise[6:11], doppler[11][:9]]).why_none is None
-    lost = MovingReturns.of(scans.points, doppler[:5] + noise[5:])
-    assert lost.count == 0
+    assert moving_returns(points, [*doppler[:6], *noise[6:11], doppler[11][:9]])[1] is None
+    lost = static(scans.points, doppler[:5] + noise[5:])
+    assert lost.moving == 0
     assert lost.why_none == "only 5 of 12 scans agree on a velocity of the sensor"
 
 
 def _too_near(scans, doppler):
-    left = MovingReturns.of(scans.points, doppler).without(scans.points)
+    left = static(scans.points, doppler).points
     return sum(int((np.linalg.norm(points, axis=1) < 2.5).sum()) for points in left)
 
 
@@ -97,8 +101,8 @@ def test_inconsistent_doppler_excludes_no_returns(drive):
     # Half of the returns have lost their Doppler, and would all be classified as moving.
     mostly = [np.where(rng.random(len(v)) < 0.5, v, 37.0 + rng.uniform(-20, 20, len(v))) for v in doppler]
     for values, why in ((noise, "scans agree on a velocity"), (mostly, "of the returns disagree")):
-        found = MovingReturns.of(scans.points, values)
-        assert found.count == 0
+        found = static(scans.points, values)
+        assert found.moving == 0
         assert why in found.why_none
         report = radarsdf.fit(
             scans.points, scans.poses, doppler_mps=values, config=FitConfig(**QUICK), progress=False
@@ -108,9 +112,9 @@ def test_inconsistent_doppler_excludes_no_returns(drive):
 
 def test_intensities_stay_with_their_returns(drive):
     scans, doppler, _ = drive
-    static = StaticReturns.of(scans.points, scans.intensities, doppler, FitConfig().returns)
-    kept = [~mask for mask in MovingReturns.of(scans.points, doppler).masks]
-    for values, all_values, mask in zip(static.intensities, scans.intensities, kept, strict=True):
+    found = StaticReturns.of(scans.points, scans.intensities, doppler, FitConfig().returns)
+    kept = [~mask for mask in moving_returns(scans.points, doppler)[0]]
+    for values, all_values, mask in zip(found.intensities, scans.intensities, kept, strict=True):
         np.testing.assert_array_equal(values, all_values[mask])
 
 
@@ -118,12 +122,12 @@ def test_intensities_stay_with_their_returns(drive):
 def test_moving_returns_of_recorded_drives_agree_with_their_flags(name):
     with np.load(recorded_scans(name)) as file:
         rows = [np.flatnonzero(file["frame"] == i) for i in range(len(file["poses"]))]
-        points, doppler, static = ([file[k][r] for r in rows] for k in ("points", "doppler", "static"))
-    found = MovingReturns.of(points, doppler)
+        points, doppler, flags_of = ([file[k][r] for r in rows] for k in ("points", "doppler", "static"))
+    masks, why_none = moving_returns(points, doppler)
     wrong = np.concatenate(
-        [found_moving == flags for found_moving, flags in zip(found.masks, static, strict=True)]
+        [found_moving == flags for found_moving, flags in zip(masks, flags_of, strict=True)]
     )
-    assert found.why_none is None
+    assert why_none is None
     assert wrong.mean() < 0.1
 
 

@@ -11,7 +11,7 @@ from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import intensity_units
-from radarsdf.returns.sums import WEIGHT_UNIT, ReturnCells, ScanSums
+from radarsdf.returns.sums import WEIGHT_UNIT, ScanSums
 from radarsdf.scans import Scans
 
 from tests.conftest import ground_and_wall
@@ -76,9 +76,8 @@ def test_radars_of_equal_noise_are_one_radar_to_the_bit():
 def test_weighted_sums_have_the_moments_of_repeated_returns():
     rays = rays_of(rig())
     again = rays.select(np.repeat(np.arange(len(rays)), np.where(rays.scans < 3, 2, 1)))
-    cells = ReturnCells.of(rays, 0.2)
     weights = np.where(rays.scans < 3, 2, 1).astype(np.int32)
-    sums, expected = ScanSums.of_cells(rays, cells, 0.2, weights=weights), ScanSums.of(again, 0.2)
+    sums, expected = ScanSums.of(rays, 0.2, weights=weights), ScanSums.of(again, 0.2)
     assert (sums.sums == expected.sums).all()
     assert (WEIGHT_UNIT * sums.counts == expected.counts).all()
     assert (WEIGHT_UNIT * sums.merged_moments()[1] == expected.merged_moments()[1]).all()

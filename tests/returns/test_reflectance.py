@@ -7,7 +7,7 @@ from radarsdf.evaluation import KNNIntensity, holdout
 from radarsdf.fitting import fit as steps
 from radarsdf.returns import intensities as plausible
 from radarsdf.returns import reflectance, sensor
-from radarsdf.returns.intensities import Intensities, Plausible, hashes
+from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.reflectance import LEVEL, NO_SURFACE, STEEP, Reflectance, Response, kinds_of
@@ -200,7 +200,7 @@ def test_limits_of_parts_equal_those_of_the_whole(monkeypatch, most):
     intensities = decibels(np.random.default_rng(0)).astype(np.float32)
     intensities[12_345] = 1e9  # a sample may miss it
     parts = Intensities()
-    keys = hashes(np.arange(len(intensities), dtype=np.uint32))
+    keys = np.random.default_rng(1).permutation(len(intensities)).astype(np.uint64)
     for rows in np.split(np.arange(len(intensities))[::-1], [10, 10, 3000, 9001]):
         parts.add(intensities[rows], keys[rows])
     found = parts.plausible()

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from radarsdf.checks import check
 from radarsdf.settings import settings
 
 MAX_FREQUENCIES = 24  # Fourier frequencies that the compiled core allows; a test compares the two numbers
@@ -73,9 +74,10 @@ class ReturnsConfig:
     the map keeps the rays, 40 bytes each. They take 0.3 kB per block of 8 × 8 × 8 leaf cells that rays crossed."""
 
     def __post_init__(self) -> None:
-        if self.max_range_m is not None and self.max_range_m <= self.min_range_m:
-            msg = f"returns.max_range_m must exceed min_range_m, {self.min_range_m}, not {self.max_range_m}"
-            raise ValueError(msg)
+        fits = self.max_range_m is None or self.max_range_m > self.min_range_m
+        check(
+            fits, f"returns.max_range_m must exceed min_range_m, {self.min_range_m}, not {self.max_range_m}"
+        )
 
 
 @settings

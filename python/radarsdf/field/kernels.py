@@ -7,6 +7,7 @@ An operator could also get the vertex table only through a global registry.
 The core gets tensors as NumPy views of the same memory. Results are bit-identical with any number of threads.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch import get_num_threads as threads
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
@@ -44,9 +46,6 @@ def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.from_numpy(numbers[first : first + math.prod(shape)].reshape(shape))
 
 
-_num_threads = torch.get_num_threads  # of the core, too: those of PyTorch in the calling thread
-
-
 def _places(points: Tensor, located: Tensor, directions: Tensor | None) -> tuple[Any, Any, Any]:
     return view(points), located.numpy(), None if directions is None else view(directions)
 
@@ -55,17 +54,17 @@ def _interpolate(
     table: VertexTable, features: Tensor, points: Tensor, located: Tensor, directions: Tensor | None
 ) -> Tensor:
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-    table.interpolate(view(features), *_places(points, located, directions), out.numpy(), _num_threads())
+    table.interpolate(view(features), *_places(points, located, directions), out.numpy(), threads())
     return out
 
 
-def _scatter(
+def scatter(
     table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
 ) -> Tensor:
     """Return the gradient (num_rows, 8) of Σ interpolated · out_grad by the features, or of its derivatives along `directions`."""
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     places = _places(points, located, directions)
-    table.scatter(*places, rows_view(out_grad), features_grad.numpy(), _num_threads())
+    table.scatter(*places, rows_view(out_grad), features_grad.numpy(), threads())
     return features_grad
 
 
@@ -79,9 +78,7 @@ def _coordinate_gradient(
 ) -> Tensor:
     points_grad = torch.empty_like(points, memory_format=torch.contiguous_format)
     places = _places(points, located, directions)
-    table.coordinate_gradient(
-        view(features), *places, rows_view(out_grad), points_grad.numpy(), _num_threads()
-    )
+    table.coordinate_gradient(view(features), *places, rows_view(out_grad), points_grad.numpy(), threads())
     return points_grad
 
 
@@ -91,9 +88,7 @@ def _coordinate_gradient(
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
-        located = torch.empty((len(points), table.num_levels), dtype=torch.int32, device="cpu")
-        out = points.new_empty((len(points), FEATURE_DIM * table.num_levels))
-        table.encode(view(features), view(points), located.numpy(), out.numpy(), _num_threads())
+        out, located = encode(features, points, table)
         ctx.save_for_backward(features, points, located)
         ctx.table = table
         return out
@@ -122,7 +117,7 @@ class _InterpolateBackward(torch.autograd.Function):
         ctx.table = table
         ctx.set_materialize_grads(False)  # unused gradients are None, not zeros to interpolate
         return (
-            _scatter(table, points, located, None, out_grad) if needs_features else None,
+            scatter(table, points, located, None, out_grad) if needs_features else None,
             _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
         )
 
@@ -133,24 +128,16 @@ class _InterpolateBackward(torch.autograd.Function):
         g, features, points, located = ctx.saved_tensors
         table = ctx.table
         needs_g, needs_features, needs_points = ctx.needs_input_grad[:3]
-
-        def total(*terms: Tensor | None) -> Tensor | None:
-            present = [term for term in terms if term is not None]
-            return sum(present[1:], present[0]) if present else None
-
+        of_each = ([] if a is None else [(a, None)]) + ([] if v is None else [(features, v)])
         g_grad = features_grad = points_grad = None
-        if needs_g:
-            g_grad = total(
-                None if a is None else _interpolate(table, a, points, located, None),
-                None if v is None else _interpolate(table, features, points, located, v),
-            )
+        if needs_g and of_each:
+            terms = (_interpolate(table, f, points, located, along) for f, along in of_each)
+            g_grad = functools.reduce(torch.add, terms)
         if needs_features and v is not None:
-            features_grad = _scatter(table, points, located, v, g)
-        if needs_points:
-            points_grad = total(
-                None if a is None else _coordinate_gradient(table, a, points, located, None, g),
-                None if v is None else _coordinate_gradient(table, features, points, located, v, g),
-            )
+            features_grad = scatter(table, points, located, v, g)
+        if needs_points and of_each:
+            terms = (_coordinate_gradient(table, f, points, located, along, g) for f, along in of_each)
+            points_grad = functools.reduce(torch.add, terms)
         return g_grad, features_grad, points_grad, None, None, None, None
 
 
@@ -158,7 +145,7 @@ class _Fourier(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, half_width_m: float, first: int, count: int) -> Tensor:
         out = points.new_empty((points.shape[0], 6 * count))
-        _core.fourier(view(points), half_width_m, first, count, out.numpy(), _num_threads())
+        _core.fourier(view(points), half_width_m, first, count, out.numpy(), threads())
         ctx.save_for_backward(out)
         ctx.frequencies = (half_width_m, first, count)
         return out
@@ -185,10 +172,18 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
     return _Interpolate.apply(features, points, table)  # type: ignore[no-untyped-call]
 
 
+def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
+    """Return :func:`interpolate` without gradients, and the result of :func:`locate`."""
+    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
+    out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
+    table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
+    return out, located
+
+
 def locate(points: Tensor, table: VertexTable) -> Tensor:
     """Return the rows (N, num_levels) int32, finest level first, of the occupied cells of points (N, 3), local, m; -1: none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
-    table.locate(view(points), located.numpy(), _num_threads())
+    table.locate(view(points), located.numpy(), threads())
     return located
 
 
@@ -199,11 +194,8 @@ def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequ
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
     """Return real spherical harmonics (N, 16) of degree 0 to 3 of unit vectors (N, 3). Not differentiable."""
-    if directions.requires_grad:
-        msg = "spherical_harmonics has no gradient with respect to the directions"
-        raise NotImplementedError(msg)
     out = directions.new_empty((directions.shape[0], NUM_SPHERICAL_HARMONICS))
-    _core.spherical_harmonics(view(directions), out.numpy(), _num_threads())
+    _core.spherical_harmonics(view(directions), out.numpy(), threads())
     return out
 
 
@@ -224,15 +216,15 @@ class _MLP(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, num_layers: int, *tensors: Tensor) -> Tensor:
         layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
-        out = inputs[0].new_empty((len(inputs[0]), len(layers[-1])))
-        of_layers: list[Any] = [view(layer) for layer in layers]
-        views: tuple[list[Any], list[Any], list[Any]] = (
+        out = inputs[0].new_empty((inputs[0].shape[0], layers[-1].shape[0]))
+        keep = any(ctx.needs_input_grad)
+        views = (
             [rows_view(x) for x in inputs],
-            of_layers[::2],
-            of_layers[1::2],
+            [view(w) for w in layers[::2]],
+            [view(b) for b in layers[1::2]],
         )
+        ctx.hidden = _core.mlp(*views, out.numpy(), keep, threads())
         ctx.views = views
-        ctx.hidden = _core.mlp(*views, out.numpy(), any(ctx.needs_input_grad), _num_threads())
         ctx.save_for_backward(*tensors)
         ctx.num_layers = num_layers
         return out
@@ -257,7 +249,7 @@ class _MLP(torch.autograd.Function):
         by_weights, by_biases = (views[:split:2], views[1:split:2]) if by_layers else (None, None)
         given: tuple[list[Any], list[Any], list[Any]] = ctx.views
         _core.mlp_backward(
-            *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], _num_threads()
+            *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
         )
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
 

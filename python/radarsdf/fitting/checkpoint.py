@@ -19,7 +19,6 @@ from radarsdf.returns.rays import Rays
 
 FORMAT = "radarsdf.checkpoint"
 _EVERY_S = 30.0  # minimum time between two writes, s
-_NONE = object()  # sentinel for a setting that one of two configurations lacks
 _SHARE = 0.02  # maximum share of the time spent on writing
 
 
@@ -90,7 +89,7 @@ class Checkpoint:
         except (SafetensorError, AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             msg = f"{self._path} is not a checkpoint of a fit: it is not overwritten"
             raise ValueError(msg) from error
-        changed = sorted(k for k in mine.keys() | other.keys() if mine.get(k, _NONE) != other.get(k, _NONE))
+        changed = sorted(name for name in mine.keys() | other.keys() if mine.get(name) != other.get(name))
         words = {
             "version": f"was written by radarsdf {found['version']!r:.50}: remove it to begin again",
             "config": f"is a checkpoint of another configuration: {', '.join(changed)!s:.200} differ",

@@ -13,8 +13,8 @@ from radarsdf._core import FEATURE_DIM, CellSet
 from radarsdf.arrays import Bools
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
-from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_BAND_CELLS, NEAR_SAMPLES, seen_jointly
+from radarsdf.field.field import intensity_widths, sdf_widths, weights_of
+from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_BAND_CELLS, NEAR_SAMPLES, near_and_labelled
 from radarsdf.fitting.surface_returns import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.memory import available_bytes
 from radarsdf.returns.ghosts import FEWEST_SAMPLED
@@ -260,8 +260,10 @@ def seconds_of(
     widths = sdf_widths(config)
     shared = of_field * (_S_PER_INPUT * widths[0] + _S_PER_MULTIPLICATION * weights_of(widths))
     if with_network:
-        joint_seen = schedule.joint_iterations * seen_jointly(config, schedule.batch_size)
-        seen = joint_seen + later * schedule.intensity_batch_size
+        _, seen_jointly = near_and_labelled(config, schedule.batch_size)
+        if config.training.intensity_in_free_space:
+            seen_jointly = schedule.batch_size
+        seen = schedule.joint_iterations * seen_jointly + later * schedule.intensity_batch_size
         shared += 3 * seen * _S_PER_MULTIPLICATION * weights_of(intensity_widths(config))
     moved = 0 if config.moves_rows(with_network) else rows * iterations
     threads = min(resolve_num_threads(config.num_threads), os.cpu_count() or 1)

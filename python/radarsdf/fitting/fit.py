@@ -14,8 +14,7 @@ from radarsdf._core import cell_keys, stable_order
 from radarsdf.arrays import Bools, Floats32, Ints
 from radarsdf.checks import AnyPath, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.field import Field
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import Field, NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule, check_extent, check_fit, skipped_parts
 from radarsdf.fitting.surface_returns import SurfaceReturns, average_surface, occupied_cells
@@ -144,7 +143,7 @@ class FitInput:
     scale: IntensityScale | None  # scale of their intensities
     poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans, used to estimate the `sensor`
     moving: int = 0  # number of moving returns left out
-    why_none_moving: str | None = None  # see :class:`radarsdf.returns.moving.MovingReturns`
+    why_none_moving: str | None = None  # why Doppler was not used, in words
     inside: Bools | None = None
     """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
     clutter_ratio: float | None = None  # share of the returns not on a thin surface
@@ -169,7 +168,7 @@ def fit_rays(
     try:
         # A map created in inference mode could not compute gradients later.
         with torch.inference_mode(mode=False), ThreadPool(config.num_threads) as pool:
-            contents, stop = _Fit(config, progress, checkpoint, pool, {}).run(read)
+            contents, stop = _Fit(config, progress, checkpoint, pool).run(read)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption
     radar_map = RadarMap(contents)
@@ -187,12 +186,11 @@ class _Fit:
     progress: bool | None
     checkpoint: AnyPath | None
     pool: ThreadPool
-    seconds: dict[str, float]  # wall-clock time of each step
-    _ends_s: list[float] = dataclasses.field(default_factory=lambda: [time.perf_counter()])
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # wall-clock time of each step
+    _start_s: float = dataclasses.field(default_factory=time.perf_counter)
 
     def _lap(self, step: str) -> None:
-        self._ends_s.append(time.perf_counter())
-        self.seconds[step] = self._ends_s[-1] - self._ends_s[-2]
+        self.seconds[step] = time.perf_counter() - self._start_s - sum(self.seconds.values())
 
     def run(self, read: Callable[[], FitInput]) -> tuple[MapContents, _Stop]:
         """Return the contents of the map, and the reason for an early end of the training, if any."""
@@ -246,8 +244,7 @@ class _Fit:
 
         sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
         schedule = Schedule.of(config, with_intensity=with_network, **sizes)
-        report = _report(given, learnt, surface, field, schedule, config)
-        contents = _contents(given, learnt, surface, field, returns, config, report, num_threads)
+        contents = self._contents(given, learnt, surface, field, returns, schedule)
         closes = learnt.intensities is not None and config.closes_intensity
         training = None
         if isinstance(field, NeuralField):
@@ -256,54 +253,55 @@ class _Fit:
         self._lap("start_s")
         return contents, (learnt, surface.surfels) if closes else None, training, saved
 
+    def _contents(
+        self,
+        given: FitInput,
+        learnt: Rays,
+        surface: SurfaceReturns,
+        field: Field,
+        returns: ReturnsOfCells,
+        schedule: Schedule,
+    ) -> MapContents:
+        config, leaf_m, num_threads = self.config, self.config.leaf_size_m, self.pool.num_threads
+        rays, scale, surfels = given.rays, given.scale, surface.surfels
+        sensor, sensors = given.sensor, given.sensors
+        clutter_ratio, returns_per_cell = given.clutter_ratio, given.returns_per_cell
+        if sensor is None:
+            assert given.poses is not None
+            sensor = Sensor.of_rays(rays, given.poses, surface.noise.mean)
+            sensors = {} if given.radars is None else given.radars.sensors(rays, given.poses)
+        noise, true, box_cells = surface.noise, surface.true, given.box_cells
 
-def _contents(
-    given: FitInput,
-    learnt: Rays,
-    surface: SurfaceReturns,
-    field: Field,
-    returns: ReturnsOfCells,
-    config: FitConfig,
-    report: dict[str, Any],
-    num_threads: int,
-) -> MapContents:
-    rays, scale, surfels, leaf_m = given.rays, given.scale, surface.surfels, config.leaf_size_m
-    sensor, sensors = given.sensor, given.sensors
-    clutter_ratio, returns_per_cell = given.clutter_ratio, given.returns_per_cell
-    if sensor is None:
-        assert given.poses is not None
-        sensor = Sensor.of_rays(rays, given.poses, surface.noise.mean)
-        sensors = {} if given.radars is None else given.radars.sensors(rays, given.poses)
-    noise, true, box_cells = surface.noise, surface.true, given.box_cells
+        def free_space() -> FreeSpace:
+            of_true = rays if true is None else rays.select(true)
+            return FreeSpace.of(of_true, noise, leaf_m, box_cells, num_threads)
 
-    def free_space() -> FreeSpace:
-        of_true = rays if true is None else rays.select(true)
-        return FreeSpace.of(of_true, noise, leaf_m, box_cells, num_threads)
+        def view_statistics() -> ViewStatistics:
+            known = learnt.with_intensity
+            if scale is None or not known.any():
+                return ViewStatistics.none()
+            chosen = learnt if known.all() else learnt.select(known)
+            assert chosen.intensities is not None
+            return ViewStatistics.of(chosen, scale.to_unit(chosen.intensities), leaf_m)
 
-    def view_statistics() -> ViewStatistics:
-        known = learnt.with_intensity
-        if scale is None or not known.any():
-            return ViewStatistics.none()
-        chosen = learnt if known.all() else learnt.select(known)
-        assert chosen.intensities is not None
-        return ViewStatistics.of(chosen, scale.to_unit(chosen.intensities), leaf_m)
-
-    # Only grids, comparisons and files ask for these, which took a third of a fit. The map keeps the rays until then.
-    deferred = config.returns.free_space
-    return MapContents(
-        field=field,
-        config=config,
-        report=report,
-        origin=rays.origin,
-        intensity_scale=scale,
-        evidence=Evidence.of(returns, rays, field.table.leaf_keys(), leaf_m, num_threads, given.visibility),
-        free_space=Deferred(free_space) if deferred else FreeSpace.none,
-        view_statistics=Deferred(view_statistics) if deferred else ViewStatistics.none,
-        clutter_ratio=surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
-        returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
-        sensor=sensor,
-        sensors=sensors,
-    )
+        # Only grids, comparisons and files ask for these, which took a third of a fit. The map keeps the rays until then.
+        deferred = config.returns.free_space
+        return MapContents(
+            field=field,
+            config=config,
+            report=_report(given, learnt, surface, field, schedule, config),
+            origin=rays.origin,
+            intensity_scale=scale,
+            evidence=Evidence.of(
+                returns, rays, field.table.leaf_keys(), leaf_m, num_threads, given.visibility
+            ),
+            free_space=Deferred(free_space) if deferred else FreeSpace.none,
+            view_statistics=Deferred(view_statistics) if deferred else ViewStatistics.none,
+            clutter_ratio=surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
+            returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
+            sensor=sensor,
+            sensors=sensors,
+        )
 
 
 def _report(

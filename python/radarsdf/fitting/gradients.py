@@ -19,7 +19,7 @@ from radarsdf import _core
 from radarsdf.arrays import Array, Ints32
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field import kernels
-from radarsdf.field.neural_field import NeuralField, cells_width, fourier_width
+from radarsdf.field.field import NeuralField, cells_width, fourier_width
 from radarsdf.fitting.sampling import Batch, Dropout
 from radarsdf.threads import ThreadPool
 
@@ -88,12 +88,6 @@ class GradientBackend(ABC):
     @abstractmethod
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
         """Return gradients of `losses`, and the result of `meanwhile`, which the calling thread runs while others work."""
-
-    def state(self) -> dict[str, Tensor]:
-        return {"generator": self._generator.get_state()}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        self._generator.set_state(state["generator"])
 
     def _draw_dropouts(self) -> list[tuple[int, Dropout]]:
         """Draw the dropout of each part of the encoding, with its width, for the intensity network alone."""

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.checks import check
+from radarsdf.field.field import VertexFeatures
 from radarsdf.field.kernels import large_zeros, view
-from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import ThreadPool
 
@@ -21,18 +21,19 @@ _STATE_DIM, _LAST_STEP = 8, 5
 
 
 class Optimiser(ABC):
-    """Base class. `learning_rate` applies to the next step, `full_rate` is the initial one.
-
-    The method `state` returns all that the next steps depend on, except the parameters, without copying.
-    """
+    """Optimiser of `parameters`."""
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         self.parameters = list(parameters)
-        self.full_rate = self.learning_rate = learning_rate
+        self.learning_rate = learning_rate
 
     @abstractmethod
-    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:
-        """Update the parameters by `gradients`, in the same order, on the threads of `pool` if it is idle."""
+    def state(self) -> dict[str, Tensor]:
+        """Return all that the next steps depend on, except the parameters, without copying."""
+
+    @abstractmethod
+    def step(self, gradients: Sequence[Tensor], number: int, share: float, pool: ThreadPool | None) -> None:
+        """Take step `number`, from 1 on, by a `share` of the learning rate, on the threads of `pool` if it is idle."""
 
 
 class Adam(Optimiser):
@@ -45,23 +46,16 @@ class Adam(Optimiser):
         super().__init__(parameters, learning_rate)
         self._means = [torch.zeros_like(p) for p in self.parameters]
         self._squares = [torch.zeros_like(p) for p in self.parameters]
-        self._step = torch.zeros((), dtype=torch.float32, device="cpu")
 
     def state(self) -> dict[str, Tensor]:
         lists = {"mean": self._means, "square": self._squares}
-        state = {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
-        return state | {"step": self._step}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        for name, value in self.state().items():
-            value.copy_(state[name])
+        return {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
 
     @torch.no_grad()
-    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:  # noqa: ARG002
-        self._step.add_(1)
-        steps, (beta1, beta2) = [self._step] * len(self.parameters), _BETAS
+    def step(self, gradients: Sequence[Tensor], number: int, share: float, pool: ThreadPool | None) -> None:  # noqa: ARG002
+        steps = [torch.tensor(number, dtype=torch.float32, device="cpu")] * len(self.parameters)
         of_each = self.parameters, list(gradients), self._means, self._squares, list[Tensor](), steps
-        rates = {"lr": self.learning_rate, "beta1": beta1, "beta2": beta2, "eps": _EPSILON}
+        rates = {"lr": share * self.learning_rate, "beta1": _BETAS[0], "beta2": _BETAS[1], "eps": _EPSILON}
         step: Any = torch._fused_adam_  # the kernel has no public name
         step(*of_each, **rates, weight_decay=0.0, amsgrad=False, maximize=False)
 
@@ -75,7 +69,6 @@ class Soap(Optimiser):
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         super().__init__(parameters, learning_rate)
-        self.step_count = 0
         # A layer with one output has a weight vector: there is no basis to rotate.
         self._matrices = [i for i, p in enumerate(self.parameters) if p.ndim == 2 and min(p.shape) > 1]
         self._others = [i for i in range(len(self.parameters)) if i not in self._matrices]
@@ -87,27 +80,16 @@ class Soap(Optimiser):
 
     def state(self) -> dict[str, Tensor]:
         state = {f"memory.{i}": memory for i, memory in enumerate(self._memories)}
-        count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
-        return state | {f"adam.{k}": v for k, v in self._adam.state().items()} | {"step_count": count}
+        return state | {f"adam.{k}": v for k, v in self._adam.state().items()}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        count = int(state["step_count"])
-        check(count >= 0, f"an optimiser cannot have made {count} steps")
-        for i, memory in enumerate(self._memories):
-            memory.copy_(state[f"memory.{i}"])
-        self._adam.restore({k: state[f"adam.{k}"] for k in self._adam.state()})
-        self.step_count = count
-
-    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:
-        self.step_count += 1
-        self._adam.learning_rate = self.learning_rate
-        self._adam.step(_at(self._others, gradients))
+    def step(self, gradients: Sequence[Tensor], number: int, share: float, pool: ThreadPool | None) -> None:
+        self._adam.step(_at(self._others, gradients), number, share, None)
         _core.soap_step(
             weights=self._weights,
             gradients=[g.numpy() for g in _at(self._matrices, gradients)],
             memories=self._memory_views,
-            step=self.step_count,
-            learning_rate=self.learning_rate,
+            step=number,
+            learning_rate=share * self.learning_rate,
             pool=None if pool is None else pool.core_threads,
         )
 
@@ -125,37 +107,33 @@ class RowAdam:
     """
 
     def __init__(self, cells: VertexFeatures, learning_rate: float) -> None:
-        self.full_rate = self.learning_rate = learning_rate
-        self.step_count = 0
-        self._cells = cells
+        self._cells, self._learning_rate = cells, learning_rate
         self._states = large_zeros(len(cells.features), _STATE_DIM, dtype=torch.int32)
         self._arrays = view(cells.features), self._states.numpy()
         self._decays = torch.zeros(0, 2, dtype=torch.float32, device="cpu")
 
     def state(self) -> dict[str, Tensor]:
-        count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
-        return {"states": self._states, "step_count": count}
+        return {"states": self._states}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        count, last_step = int(state["step_count"]), state["states"][:, _LAST_STEP]
-        first, last = (int(last_step.min()), int(last_step.max())) if last_step.numel() else (0, 0)
-        # The core does not check it.
-        check(0 <= first <= last <= count, f"a row cannot have moved after step {count}")
-        self._states.copy_(state["states"])
+    def check_state(self, steps: int) -> None:
+        """Raise a ValueError if a row has moved after `steps`, which the core does not check."""
+        last_step = self._states.numpy()[:, _LAST_STEP]
+        fits = 0 <= last_step.min(initial=0) <= last_step.max(initial=0) <= steps
+        check(fits, f"a row cannot have moved after step {steps}")
         self._states[:, _LAST_STEP + 1 :] = 0  # the core indexes by the next number
-        self.step_count = count
 
     @torch.no_grad()
-    def step(self, touched: Touched, pool: ThreadPool, meanwhile: Callable[[], None]) -> None:
+    def step(
+        self, touched: Touched, number: int, share: float, pool: ThreadPool, meanwhile: Callable[[], None]
+    ) -> None:
         """Update the rows touched by a batch. The calling thread first runs `meanwhile`, then helps the others."""
-        self.step_count += 1
-        if self.step_count >= len(self._decays):
-            powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64, device="cpu")[:, None]
+        if number >= len(self._decays):
+            powers = torch.arange(2 * number + 1022, dtype=torch.float64, device="cpu")[:, None]
             decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
             # Denormal numbers would be slow, and are negligible compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         of_batch = touched.points, touched.located, touched.gradient
-        rates = self.step_count, self.learning_rate, _EPSILON
+        rates = number, share * self._learning_rate, _EPSILON
         self._cells.table.begin_adam_step(
             *of_batch, *self._arrays, self._decays.numpy(), *rates, pool.core_threads
         )

@@ -34,11 +34,6 @@ def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
     return near, near if training.intensity_in_free_space else min(near, training.intensity_batch_size)
 
 
-def seen_jointly(config: FitConfig, batch_size: int) -> int:
-    """Return the number of samples of a batch that the intensity network sees in a joint iteration."""
-    return batch_size if config.training.intensity_in_free_space else near_and_labelled(config, batch_size)[1]
-
-
 @dataclass(frozen=True)
 class Batch:
     """B samples on rays, in consecutive parts, each with the samples near the surface first. One thread processes each part."""
@@ -66,7 +61,7 @@ class RaySampler:
         batch_size: int,
         generator: torch.Generator,
         neighbours: int = 1,
-        intensities: Tensor | None = None,
+        intensities: Floats32 | None = None,
         num_threads: int = 1,
     ) -> None:
         self._config = config
@@ -82,17 +77,15 @@ class RaySampler:
         self._layouts: dict[tuple[int, ...], _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
-        """Return the order of the rays, as a generator state, and the position in it: -1 before the first batch."""
-        following = self._next if len(self._runs) else -1
-        following_ray = torch.tensor(following, dtype=torch.int64, device="cpu")
-        return {"order_from": self._order_from, "next": following_ray}
+        """Return the order of the rays, as a generator state, and the position in it: 0 before an order is drawn."""
+        following = torch.tensor(self._next, dtype=torch.int64, device="cpu")
+        return {"order_from": self._order_from, "next": following}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        following = int(state["next"])
-        fits = -1 <= following <= len(self._rays) + self._neighbours
+    def restore(self, order_from: Tensor, following: int) -> None:
+        fits = 0 <= following <= len(self._rays) + self._neighbours
         check(fits, f"a sampler of {len(self._rays)} rays cannot be at ray {following}")
-        if following >= 0:
-            self._generator.set_state(state["order_from"])
+        if following > 0:
+            self._generator.set_state(order_from)
             self._draw_order()
             self._next = following
 
@@ -140,13 +133,13 @@ class RaySampler:
         return Batch(*_core.draw_samples(self._rays, places, *of_samples, seed), layout.parts)
 
 
-def _in_morton_order(rays: Rays, values: Tensor | None, leaf_size_m: float, num_threads: int) -> Floats32:
+def _in_morton_order(rays: Rays, values: Floats32 | None, leaf_size_m: float, num_threads: int) -> Floats32:
     """Return :attr:`Batch.of_ray` for all rays, in Morton order of their returns."""
     # A ray is one row of 32 bytes, half a cache line: a batch reads it by one gather.
     order = _core.stable_order(_core.cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
     if values is not None:
-        columns.append(values.numpy()[:, None])
+        columns.append(values[:, None])
     rows = np.empty((len(rays), sum(column.shape[1] for column in columns)), np.float32)
     _core.gather_rows([np.ascontiguousarray(column) for column in columns], order, rows, num_threads)
     return rows

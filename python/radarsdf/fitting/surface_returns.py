@@ -51,7 +51,7 @@ class SurfaceReturns:
         if sums is None:
             leaves = ReturnCells.of(rays, leaf_m, num_threads)
             weights = None if noise is None else noise.weights(rays)
-            sums = ScanSums.of_cells(rays, leaves, leaf_m, num_threads, weights)
+            sums = ScanSums.of(rays, leaf_m, num_threads, leaves, weights)
         surfels = Surfels.of_sums(sums, num_threads)
         means = None if config.train else MeanRays.of_sums(sums, num_threads)
         cells, true, kept = None, None, inside  # cells (N,): row of the surfel's cell of each return

@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -16,7 +16,7 @@ from tqdm import tqdm
 from radarsdf.arrays import Array
 from radarsdf.checks import check, hides_bar
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.neural_field import NeuralField
+from radarsdf.field.field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule
 from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, Losses
@@ -123,26 +123,23 @@ class LossHistory:
     def state(self) -> dict[str, Tensor]:
         return {name: torch.from_numpy(a) for name, a in (*self._spans.items(), ("recent", self._recent))}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        for name, tensor in self.state().items():
-            tensor.copy_(state[name])
-
 
 @dataclass(frozen=True)
 class _Stage:
     name: str
-    losses: Losses
     iterations: int
     joint: int  # iterations of the sdf stage that train the intensity network, too, evenly spread
-    optimisers: list[Optimiser]  # optimisers of the trained parameters, in the order of their gradients
-    rows: RowAdam | None  # optimiser of the features if only touched rows move
-    draw: Callable[[], Batch]
 
     def done(self, count: int) -> dict[str, int]:
         """Return how often each loss was trained after `count` iterations of this stage."""
         if self.name == "sdf":
             return {"sdf": count, "intensity": count * self.joint // self.iterations}
         return {"intensity": self.joint + count}
+
+    def losses(self, i: int) -> Losses:
+        if self.name == "intensity":
+            return "intensity"
+        return "joint" if self.done(i + 1)["intensity"] > self.done(i)["intensity"] else "sdf"
 
 
 class Training:
@@ -170,8 +167,8 @@ class Training:
         network, training = field.intensity_network, config.training
         kind = AutogradGradients if network is not None and config.networks.normals else CoreGradients
         seeds = (config.seed * _GENERATORS + i for i in range(_GENERATORS))
-        self._generator, of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
-        self._backend = kind(field, config, schedule.dropout_scale, of_dropout, pool)
+        self._generator, self._of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
+        self._backend = kind(field, config, schedule.dropout_scale, self._of_dropout, pool)
         self._scale = None if network is None else scale
         # A sampler copies the rays, so only one exists at a time.
         self._sampler = self._sampler_of(surface)
@@ -191,7 +188,7 @@ class Training:
     def _sampler_of(self, rays: Rays) -> RaySampler:
         unit = None
         if self._scale is not None and rays.intensities is not None:
-            unit = torch.from_numpy(self._scale.to_unit(rays.intensities))
+            unit = self._scale.to_unit(rays.intensities)
         size, neighbours = self._schedule.batch_size, self._schedule.neighbours
         return RaySampler(rays, self._config, size, self._generator, neighbours, unit, self._pool.num_threads)
 
@@ -206,20 +203,18 @@ class Training:
         state = {
             "done": torch.tensor(list(self.iterations_done.values()), dtype=torch.int64, device="cpu"),
             "losses": torch.tensor(losses, dtype=torch.float64, device="cpu"),
-            "of_all_returns": torch.tensor(self._later is None, dtype=torch.int64, device="cpu"),
             "generator": self._generator.get_state(),
+            "backend.generator": self._of_dropout.get_state(),
         }
-        state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
-        for name, part in self._parts():
-            state |= {f"{name}.{key}": value for key, value in part.state().items()}
-        return state
+        state |= {f"sampler.{key}": value for key, value in self._sampler.state().items()}
+        return state | self._tensors()
 
-    def _parts(self) -> Iterable[tuple[str, Any]]:
-        yield from (("history", self.history), ("backend", self._backend), ("sampler", self._sampler))
-        if self._rows is not None:
-            yield "rows", self._rows
-        for name, optimiser in self._optimisers.items():
-            yield f"optimiser.{name}", optimiser
+    def _tensors(self) -> dict[str, Tensor]:
+        """Return the part of the state that is updated in place."""
+        parts: dict[str, Any] = {f"optimiser.{name}": own for name, own in self._optimisers.items()}
+        parts |= {"history": self.history} | ({} if self._rows is None else {"rows": self._rows})
+        tensors = {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
+        return tensors | {f"{name}.{k}": v for name, own in parts.items() for k, v in own.state().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restore a :meth:`state` of the same fit. Raise a ValueError if it is invalid."""
@@ -229,14 +224,15 @@ class Training:
         self.iterations_done.update(done)
         losses = zip(done, state["losses"].tolist(), strict=True)
         self.losses.update({name: loss for name, loss in losses if done[name]})
-        for name, parameter in self._field.named_parameters():
-            parameter.data.copy_(state[f"field.{name}"])
-        if state["of_all_returns"]:
+        for name, tensor in self._tensors().items():
+            tensor.copy_(state[name])
+        if self._rows is not None:
+            self._rows.check_state(done["sdf"])
+        if done["intensity"] > self._schedule.joint_iterations:
             self._draw_from_all_returns()
-        for name, part in self._parts():
-            own = {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")}
-            part.restore(own)
+        self._sampler.restore(state["sampler.order_from"], int(state["sampler.next"]))
         self._generator.set_state(state["generator"])  # last, because the sampler changes it
+        self._of_dropout.set_state(state["backend.generator"])
 
     def report(self) -> dict[str, Any]:
         names = ("iterations", "iterations_done", "losses")
@@ -248,7 +244,9 @@ class Training:
         Raises :class:`Diverged`, with the field reset to the last parameters that passed the check; or after Ctrl-C a
         KeyboardInterrupt, between two iterations.
         """
-        stages = self._stages()
+        shared = self._schedule.joint_iterations
+        lengths = {"sdf": self.iterations["sdf"], "intensity": self.iterations["intensity"] - shared}
+        stages = [_Stage(name, length, shared) for name, length in lengths.items() if length > 0]
         self.history.start()
         total, done = sum(stage.iterations for stage in stages), sum(map(self._done, stages))
         with (
@@ -264,17 +262,6 @@ class Training:
                 checkpoint.write(self.state())
             if interrupted():  # the training is done, but the program that called the fit should stop too
                 raise KeyboardInterrupt
-
-    def _stages(self) -> list[_Stage]:
-        joint = "intensity" in self._optimisers
-        optimisers, shared = list(self._optimisers.values()), self._schedule.joint_iterations
-        losses: Losses = "joint" if joint else "sdf"
-        stages = [_Stage("sdf", losses, self.iterations["sdf"], shared, optimisers, self._rows, self._batch)]
-        left = self.iterations["intensity"] - shared
-        if joint and left > 0:
-            draw = self._labelled_batch
-            stages.append(_Stage("intensity", "intensity", left, shared, optimisers[-1:], None, draw))
-        return stages
 
     def _batch(self) -> Batch:
         return self._sampler.batch(self._backend.num_parts(self._schedule.batch_size))
@@ -293,8 +280,10 @@ class Training:
     def _run_stage(
         self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
     ) -> None:
-        rows, iterations = stage.rows, stage.iterations
-        changing = [p for optimiser in stage.optimisers for p in optimiser.parameters]
+        first, iterations = stage.name == "sdf", stage.iterations
+        rows, draw = (self._rows, self._batch) if first else (None, self._labelled_batch)
+        optimisers = self._optimisers if first else {"intensity": self._optimisers["intensity"]}
+        changing = [p for optimiser in optimisers.values() for p in optimiser.parameters]
         if rows is not None:
             changing.append(self._field.cells.features)
         every = max(_CHECK_EVERY, sum(map(len, changing)) // _ROWS_PER_ITERATION)
@@ -316,23 +305,20 @@ class Training:
             judge = i % every == every - 1 or i == iterations - 1
             pause = stop or write or judge
             # Samples are not prefetched before the state is written: it would include their draw.
-            batch = ahead or stage.draw()
-            done = stage.done(i + 1)
-            trains_all = stage.losses != "joint" or done["intensity"] > stage.done(i)["intensity"]
-            losses = stage.losses if trains_all else "sdf"
-            found, ahead = self._backend.of(losses, batch, (lambda: None) if pause else stage.draw)
+            batch = ahead or draw()
+            done, losses = stage.done(i + 1), stage.losses(i)
+            found, ahead = self._backend.of(losses, batch, (lambda: None) if pause else draw)
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
-            moved = stage.optimisers if trains_all else stage.optimisers[:-1]
-            move_networks = functools.partial(_move_networks, found, moved, share)
+            moved = {name: own for name, own in optimisers.items() if losses != "sdf" or name != "intensity"}
+            move_networks = functools.partial(_move_networks, found, moved, done, share)
             if rows is None:
                 move_networks(self._pool)
             else:
                 assert found.touched is not None
-                rows.learning_rate = share * rows.full_rate
-                rows.step(found.touched, self._pool, meanwhile=move_networks)
+                rows.step(found.touched, done["sdf"], share, self._pool, meanwhile=move_networks)
             self.losses[stage.name] = loss
             for name, count in done.items():
                 self.iterations_done[name] = min(count, self.iterations[name])
@@ -356,9 +342,13 @@ class Training:
 
 
 def _move_networks(
-    found: Gradients, optimisers: list[Optimiser], share: float, pool: ThreadPool | None = None
+    found: Gradients,
+    optimisers: dict[str, Optimiser],
+    done: dict[str, int],
+    share: float,
+    pool: ThreadPool | None = None,
 ) -> None:
     total = iter(found.by_parameters)
-    for optimiser in optimisers:
-        optimiser.learning_rate = share * optimiser.full_rate
-        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))), pool)
+    for name, optimiser in optimisers.items():
+        own = list(itertools.islice(total, len(optimiser.parameters)))
+        optimiser.step(own, done[name if name in done else "sdf"], share, pool)

@@ -26,7 +26,7 @@ from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Limits
 from radarsdf.poses.locate import locate
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex
-from radarsdf.returns.moving import MovingReturns
+from radarsdf.returns.moving import moving_returns
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Label, Mounted, checked_mountings
 from radarsdf.scans import Scans
@@ -487,7 +487,7 @@ def _checked_scan(
         speeds = compact(checks.real_array(doppler_mps, "doppler_mps"))
         checks.check_values_of_scan(speeds, scan, "doppler_mps", 0)
         if config.drop_moving:
-            moving = MovingReturns.of([scan], [speeds]).masks[0]
+            moving = moving_returns([scan], [speeds])[0][0]
             static = ~moving if moving.any() else None
     if time_s is not None:
         time_s, latest = checks.number(time_s, "time_s"), checks.MAX_TIME_S

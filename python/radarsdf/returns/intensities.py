@@ -11,16 +11,6 @@ from radarsdf.arrays import Array, Bools, Floats32, Ints, Keys
 from radarsdf.checks import check, real_array
 
 
-def hashes(*columns: Array) -> Keys:
-    """Return pseudo-random keys (N,) of rows with values (N,) of four bytes each; equal rows have equal keys."""
-    found = np.zeros(len(columns[0]), np.uint64)
-    for column in columns:
-        found ^= np.ascontiguousarray(column).view(np.uint32)
-        found *= np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd
-        found ^= found >> np.uint64(32)
-    return found
-
-
 def sample(keys: Keys, most: int) -> Ints:
     """Return the rows of the `most` smallest keys (N,), or of all."""
     return np.arange(len(keys)) if len(keys) <= most else np.argpartition(keys, most)[:most]
@@ -44,8 +34,13 @@ class Plausible:
 
     @classmethod
     def of(cls, intensities: Array, keys: Keys | None = None) -> "Plausible":
+        """Find the limits from intensities (N,), of samples by pseudo-random `keys` (N,); None: by row."""
+        if keys is None:
+            keys = np.arange(len(intensities), dtype=np.uint64)
+            keys *= np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd
+            keys ^= keys >> np.uint64(32)
         known = Intensities()
-        known.add(intensities, hashes(np.arange(len(intensities), dtype=np.uint32)) if keys is None else keys)
+        known.add(intensities, keys)
         return known.plausible()
 
     def holds(self, intensities: Array) -> Bools:
@@ -66,7 +61,7 @@ class Intensities:
         self.low, self.high = math.inf, -math.inf
 
     def add(self, intensities: Array, keys: Keys) -> None:
-        """Add intensities (N,), sensor units, NaN where missing, with keys (N,) by :func:`hashes`."""
+        """Add intensities (N,), sensor units, NaN where missing, with pseudo-random keys (N,)."""
         none = np.isnan(intensities)
         known, keys = (intensities[~none], keys[~none]) if none.any() else (intensities, keys)
         if len(known) == 0:

@@ -166,54 +166,37 @@ _MIN_SHARE_WITH_VELOCITY = 0.5  # minimum share of the scans with enough returns
 _MAX_MOVING = 0.4  # maximum share of the returns; if more disagree, the Doppler is misinterpreted
 
 
-@dataclass(frozen=True)
-class MovingReturns:
-    """Moving returns of F scans."""
+def moving_returns(
+    points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike], rig: Rig | None = None
+) -> tuple[list[Bools], str | None]:
+    """Return masks (N_i,) of the moving returns of scans (N_i, 3), sensor frame, m, and why Doppler was not used, in words.
 
-    masks: list[Bools]  # F arrays (N_i,). All False for a scan without a velocity of the sensor
-    why_none: str | None  # why Doppler was not used, in words
-
-    @classmethod
-    def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> "MovingReturns":
-        """Build from scans (N_i, 3), sensor frame, m, and Doppler (N_i,), m/s, either sign, NaN where missing."""
-        scans, _, _ = check_scans(points)
-        speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
-        none = [np.zeros(len(scan), bool) for scan in scans]
-        tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_DOPPLER_RETURNS]
-        found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
-        telling = [(i, velocity) for i, velocity in zip(tried, found, strict=True) if velocity.found]
-        if len(telling) < max(1, _MIN_SHARE_WITH_VELOCITY * len(tried)):
-            few = f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor"
-            return cls(none, filler or few)
-        masks = list(none)
-        for i, velocity in telling:
-            masks[i] = ~velocity.static & np.isfinite(speeds[i]) & scans[i].any(axis=1)
-        share = sum(int(masks[i].sum()) for i, _ in telling) / sum(len(masks[i]) for i, _ in telling)
-        if share > _MAX_MOVING:
-            return cls(none, f"{share:.0%} of the returns disagree with the sensor's own motion")
-        return cls(masks, None)
-
-    @classmethod
-    def of_radars(
-        cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike], rig: Rig | None
-    ) -> "MovingReturns":
-        """:meth:`of` for each radar: they differ in the sign of the Doppler and in its ambiguity interval."""
-        if rig is None:
-            return cls.of(points, doppler_mps)
+    `doppler_mps` (N_i,): m/s, either sign, NaN where missing. The masks of a scan without a velocity of the sensor are False.
+    Each radar of a `rig` is judged alone: they differ in the sign of the Doppler and in its ambiguity interval.
+    """
+    if rig is not None:
         masks, why = [np.zeros(0, bool)] * len(rig.of_scan), list[str]()
         for label, rows in rig.scans_of_radars().items():
-            own = cls.of([points[i] for i in rows], [doppler_mps[i] for i in rows])
-            why += [] if own.why_none is None else [f"{label}: {own.why_none}"]
-            for i, mask in zip(rows.tolist(), own.masks, strict=True):
+            own, why_none = moving_returns([points[i] for i in rows], [doppler_mps[i] for i in rows])
+            why += [] if why_none is None else [f"{label}: {why_none}"]
+            for i, mask in zip(rows.tolist(), own, strict=True):
                 masks[i] = mask
-        return cls(masks, "; ".join(why) or None)
-
-    @property
-    def count(self) -> int:
-        return sum(int(mask.sum()) for mask in self.masks)
-
-    def without(self, arrays: Sequence[ArrayLike]) -> list[Array]:
-        return [np.asarray(array)[~mask] for array, mask in zip(arrays, self.masks, strict=True)]
+        return masks, "; ".join(why) or None
+    scans, _, _ = check_scans(points)
+    speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
+    none = [np.zeros(len(scan), bool) for scan in scans]
+    tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_DOPPLER_RETURNS]
+    found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
+    telling = [(i, velocity) for i, velocity in zip(tried, found, strict=True) if velocity.found]
+    if len(telling) < max(1, _MIN_SHARE_WITH_VELOCITY * len(tried)):
+        return none, filler or f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor"
+    masks = list(none)
+    for i, velocity in telling:
+        masks[i] = ~velocity.static & np.isfinite(speeds[i]) & scans[i].any(axis=1)
+    share = sum(int(masks[i].sum()) for i, _ in telling) / sum(len(masks[i]) for i, _ in telling)
+    if share > _MAX_MOVING:
+        return none, f"{share:.0%} of the returns disagree with the sensor's own motion"
+    return masks, None
 
 
 @dataclass(frozen=True)
@@ -223,7 +206,7 @@ class StaticReturns:
     points: Iterable[ArrayLike]  # F arrays (N_i, 3), sensor frame, m
     intensities: Iterable[ArrayLike] | None  # F arrays (N_i,), sensor units
     moving: int  # number of returns left out
-    why_none: str | None  # see :class:`MovingReturns`
+    why_none: str | None  # why Doppler was not used, in words
 
     @classmethod
     def of(
@@ -234,15 +217,19 @@ class StaticReturns:
         config: ReturnsConfig,
         rig: Rig | None = None,
     ) -> "StaticReturns":
-        """Drop moving returns, see :meth:`MovingReturns.of`; keep all without Doppler or ``config.drop_moving``."""
+        """Drop :func:`moving_returns`; keep all without Doppler or ``config.drop_moving``."""
         if doppler_mps is None or not config.drop_moving:
             return cls(points, intensities, 0, None)
         points = list(one_for_each_scan(points, "points"))
         intensities = None if intensities is None else list(one_for_each_scan(intensities, "intensities"))
         check_scans(points, intensities)
-        moving = MovingReturns.of_radars(points, doppler_mps, rig)
-        values = None if intensities is None else moving.without(intensities)
-        return cls(moving.without(points), values, moving.count, moving.why_none)
+        masks, why_none = moving_returns(points, doppler_mps, rig)
+
+        def static(arrays: Sequence[ArrayLike]) -> list[Array]:
+            return [np.asarray(array)[~mask] for array, mask in zip(arrays, masks, strict=True)]
+
+        values = None if intensities is None else static(intensities)
+        return cls(static(points), values, sum(int(mask.sum()) for mask in masks), why_none)
 
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:

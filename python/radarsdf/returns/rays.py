@@ -172,14 +172,12 @@ def check_scans(
         checks.check_scan_shape(scan, i)
         returns = measured(scan)
         far = too_far(scan, returns)
-        returns &= ~far
-        num_rows = len(scan) - int(np.count_nonzero(returns))
         left_out.given += len(scan)
         left_out.far += int(np.count_nonzero(far))
-        left_out.rows += num_rows - int(np.count_nonzero(far))
-        if num_rows == len(scan):
-            left_out.empty.append(i)
-        scans.append(np.where(returns[:, None], scan, 0.0) if num_rows else scan)
+        left_out.rows += int(np.count_nonzero(~returns))
+        returns &= ~far
+        left_out.empty += [] if returns.any() else [i]
+        scans.append(scan if returns.all() else np.where(returns[:, None], scan, 0.0))
     checks.check_scan_shapes(scans)
     if intensities is None:
         return scans, None, left_out
@@ -260,9 +258,8 @@ def prepare(
         _LOG.warning(note)
     intensity = None if values is None else np.concatenate(values)[kept]
     columns = local_origin, points_m, directions, ranges_m, intensity, scan_of[kept]
-    rays = Rays(*columns, T_world_sensor[:, :3, 2].copy(), left_out.given)
-    if rig is not None:
-        rays = dataclasses.replace(rays, sensor_of_scan=rig.of_scan, num_sensors=len(rig.labels))
+    of_rig = () if rig is None else (rig.of_scan, len(rig.labels))
+    rays = Rays(*columns, T_world_sensor[:, :3, 2].copy(), left_out.given, *of_rig)
     rays = rays.without_outliers() if whole else rays
     if rays.intensities is not None and whole:
         fits = rays.with_intensity.any()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
-from radarsdf.arrays import AnyFloats, Array, Bools, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints, Ints32, Keys
 from radarsdf.checks import check
 from radarsdf.products import normal_matrix, product
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
@@ -252,7 +252,7 @@ class Reflectance:
     network_share: float = 0.0  # factor on the intensity network's prediction, to which this is added
 
     @cached_property
-    def _response(self) -> Response:
+    def response(self) -> Response:
         return Response(self.coefficients, self.table)
 
     @cached_property
@@ -293,17 +293,18 @@ class Reflectance:
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)
         groups = _Groups.of(points, directions, incidence, kind)
+        places = groups.means(points), groups.means(directions)
         times, share = 1.0, 0.0
         if ask is not None:
-            unit_vectors = groups.directions / np.linalg.norm(groups.directions, axis=1, keepdims=True)
-            answers = ask(groups.points, unit_vectors, groups.means(ranges_m))
+            unit_vectors = places[1] / np.linalg.norm(places[1], axis=1, keepdims=True)
+            answers = ask(places[0], unit_vectors, groups.means(ranges_m))
             unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, ranges_m, incidence, kinds)
         left = unit - response.at(directions, ranges_m, incidence, kinds)
         incidence = groups.means(incidence)
         del plane, kinds  # per-return arrays: frees memory
-        columns = (groups.points, groups.directions, incidence, groups.means(left), groups.weights)
+        columns = (*places, incidence, groups.means(left), groups.weights)
         options = (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads)
         keys, means, explained = fit_cell_means(_in_metres(_KINDS, leaf_size_m), _TILINGS, *columns, *options)
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
@@ -320,10 +321,6 @@ class Reflectance:
             share,
         )
 
-    def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
-        """See :meth:`~radarsdf.returns.reflectance.Response.measured`."""
-        return self._response.measured(directions, ranges_m)
-
     def at(
         self, points: Floats32, directions: Floats32, ranges_m: Floats32, num_threads: int = 0
     ) -> Floats32:
@@ -334,7 +331,7 @@ class Reflectance:
         directions = np.ascontiguousarray(directions)
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
         incidence = _incidence(self.normals, rows, directions)
-        found = self._response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
+        found = self.response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
         found += self._cells.sums(near, directions, incidence, num_threads)
         return found
 
@@ -358,34 +355,26 @@ class _Groups:
     """Returns grouped by place and view. With few returns, each is its own group."""
 
     rows: Ints32 | None  # (N,) row of each return's group. None: one group a return
-    points: Floats32  # (G, 3) mean point, local frame, m
-    directions: Floats32  # (G, 3) mean direction
     counts: Floats  # (G,) number of returns
 
     @classmethod
     def of(cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> "_Groups":
         if len(points) <= _MOST_RETURNS:
-            return cls(None, points, directions, np.ones(len(points)))
+            return cls(None, np.ones(len(points)))
         rows, count = cell_rows(kind, points, directions, incidence_rad)
-        counts = np.bincount(rows, minlength=count).astype(np.float64)
-        means = [
-            _divided(np.stack([np.bincount(rows, column, count) for column in columns.T], 1), counts)
-            for columns in (points, directions)
-        ]
-        return cls(rows, means[0], means[1], counts)
+        return cls(rows, np.bincount(rows, minlength=count).astype(np.float64))
 
     @property
     def weights(self) -> Floats32:
         return (self.counts / (1 + _CORRELATION * (self.counts - 1))).astype(np.float32)
 
     def means(self, values: Floats32) -> Floats32:
+        """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns."""
         if self.rows is None:
             return np.ascontiguousarray(values)
-        return _divided(np.bincount(self.rows, values, len(self.counts)), self.counts)
+        sums = [np.bincount(self.rows, column, len(self.counts)) for column in np.atleast_2d(values.T)]
+        means = (np.stack(sums) / self.counts).T.reshape(-1, *values.shape[1:])
+        return np.ascontiguousarray(means, np.float32)
 
     def of_returns(self, values: Floats32) -> Floats32:
         return values if self.rows is None else values[self.rows]
-
-
-def _divided(sums: Array, counts: Floats) -> Floats32:
-    return np.ascontiguousarray((sums.T / counts).T, np.float32)

@@ -87,19 +87,16 @@ class ScanSums:
     unit: int = 1  # weight of a mean return in the sums
 
     @classmethod
-    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> "ScanSums":
-        return cls.of_cells(rays, ReturnCells.of(rays, leaf_size_m, num_threads), leaf_size_m, num_threads)
-
-    @classmethod
-    def of_cells(
+    def of(
         cls,
         rays: Rays,
-        cells: ReturnCells,
         leaf_size_m: float,
         num_threads: int = 0,
+        cells: ReturnCells | None = None,
         weights: Ints32 | None = None,
     ) -> "ScanSums":
-        """Sum up `rays` by their cells. `weights` (N,): of each return, in parts of 1 / `WEIGHT_UNIT`; None: all are 1."""
+        """Sum up `rays` by their `cells`. `weights` (N,): of each return, in parts of 1 / `WEIGHT_UNIT`; None: all are 1."""
+        cells = cells or ReturnCells.of(rays, leaf_size_m, num_threads)
         where = cells.cell_of_ray, cells.keys, leaf_size_m
         sums = sum_returns(*rays.in_c_order(), *where, num_threads, weights)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)

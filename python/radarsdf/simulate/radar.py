@@ -132,9 +132,7 @@ class RadarSensor:
     def scan(self, scene: Scene, T_world_sensor: Floats, seed: int = 0, frame: int = 0) -> SimulatedScan:
         """Scan a scene once, from a pose T_world_sensor (4, 4) float64, m.
 
-        `seed` and `frame`, the index of the scan, determine all random numbers. The result has N returns: `points` (N, 3)
-        float32, sensor frame, m; `intensities` and `noiseless_intensities` (N,) float32, dB; `origin_kind` (N,) int8, codes of
-        `Origin`.
+        `seed` and `frame`, the index of the scan, determine all random numbers.
         """
         angles = self._beam_angles(generator(seed, frame, _BEAMS))
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
@@ -404,7 +402,6 @@ def simulate(scene: Scene, sensor: RadarSensor, poses: Floats, *, name: str, see
     instance(sensor, RadarSensor, "sensor")
     poses = check_poses(poses)
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
-    columns = ("points", "intensities", "noiseless_intensities", "origin_kind")
-    of_scans = {column: [getattr(scan, column) for scan in scans] for column in columns}
+    of_scans = {column: [getattr(scan, column) for scan in scans] for column in SimulatedScan._fields}
     lidar = Lidar(scene, sensor, poses.copy(), seed)
     return Simulation(poses=poses, scene=scene, sensor=sensor, name=name, seed=seed, lidar=lidar, **of_scans)
