@@ -7,18 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from radarsdf.arrays import Array, Bools, Floats32, Ints, Keys
+from radarsdf.arrays import Array, Bools, Counts32, Floats32, Ints, Keys
 from radarsdf.checks import check, real_array
 
 
-def hashes(*columns: Array) -> Keys:
-    """Return pseudo-random keys (N,) of rows with values (N,) of four bytes each; equal rows have equal keys."""
-    found = np.zeros(len(columns[0]), np.uint64)
-    for column in columns:
-        found ^= np.ascontiguousarray(column).view(np.uint32)
-        found *= np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd
-        found ^= found >> np.uint64(32)
-    return found
+def hashes(numbers: Counts32) -> Keys:
+    """Return pseudo-random keys (N,) of numbers (N,); equal numbers have equal keys."""
+    found = numbers * np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd
+    return found ^ found >> np.uint64(32)
 
 
 def sample(keys: Keys, most: int) -> Ints:

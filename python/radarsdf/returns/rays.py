@@ -260,9 +260,8 @@ def prepare(
         _LOG.warning(note)
     intensity = None if values is None else np.concatenate(values)[kept]
     columns = local_origin, points_m, directions, ranges_m, intensity, scan_of[kept]
-    rays = Rays(*columns, T_world_sensor[:, :3, 2].copy(), left_out.given)
-    if rig is not None:
-        rays = dataclasses.replace(rays, sensor_of_scan=rig.of_scan, num_sensors=len(rig.labels))
+    of_rig = () if rig is None else (rig.of_scan, len(rig.labels))
+    rays = Rays(*columns, T_world_sensor[:, :3, 2].copy(), left_out.given, *of_rig)
     rays = rays.without_outliers() if whole else rays
     if rays.intensities is not None and whole:
         fits = rays.with_intensity.any()
@@ -278,18 +277,10 @@ def check_range(low: float, high: float) -> None:
     checks.check(fits, f"intensities from {low} to {high} are too far apart for float32")
 
 
-def rays_from(
-    points: Array,
-    sensors: Floats,
-    *,
-    origin: Floats,
-    intensities: Floats32 | None,
-    scans: Ints32,
-    up_of_scan: Floats,
-) -> Rays:
-    """Build rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest as in :class:`Rays`."""
+def rays_from(points: Array, sensors: Floats, origin: Floats, scans: Ints32, up_of_scan: Floats) -> Rays:
+    """Build rays without intensities from `sensors` to `points`, (N, 3) each, local frame, m. The rest as in :class:`Rays`."""
     away = points - sensors
     ranges_m = np.maximum(_lengths(away), 1e-6)
     directions = (away / ranges_m[:, None]).astype(np.float32)
     columns = points.astype(np.float32, copy=False), directions, ranges_m.astype(np.float32)
-    return Rays(origin, *columns, intensities, scans, up_of_scan, len(points))
+    return Rays(origin, *columns, None, scans, up_of_scan, len(points))
