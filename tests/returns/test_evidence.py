@@ -8,7 +8,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
-from radarsdf.returns.evidence import _MAX_SUPPORT, Evidence, ReturnsOfCells, bridged, support_at
+from radarsdf.returns.evidence import _MAX_SUPPORT, Evidence, ReturnsOfCells, bridged
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sums import ReturnCells, lattice_of
 
@@ -200,8 +200,7 @@ def test_bridges_equal_a_search_of_all_pairs(max_cells):
     leaf_keys = leaf_keys_of(rays)
     cells = np.unique(np.floor(rays.points / np.float32(LEAF_M)).astype(int), axis=0)
     keys = cell_keys(((cells + 0.5) * LEAF_M), LEAF_M)
-    returns = ReturnCells.of(rays, LEAF_M)
-    support = support_at(keys, returns.keys, returns.counts)
+    support = within_a_cell(rays.points, keys).sum(axis=1)
     block = cells // LATTICE_BLOCK_CELLS  # the cells lie in eight of them, and every leaf cell holds returns
     same = (block[:, None] == block).all(axis=2)
     least = np.array([0.5 * np.median(support[of_block]) for of_block in same])

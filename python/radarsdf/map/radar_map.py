@@ -18,7 +18,6 @@ from radarsdf.arrays import Array, Bools, Floats, Keys
 from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, GridField, NeuralField
-
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import check_arrays
 from radarsdf.io.tensors import open_tensors, tensor_bytes

@@ -138,16 +138,8 @@ def usual_information(information: Floats32, leaf_keys: Keys, num_threads: int =
 
 
 _AT_ONCE = 1 << 20  # leaf cells: float64 sums of all would be the peak of a large fit's memory
-_MOST = float(np.iinfo(np.uint16).max)
 
-
-def support_at(leaf_keys: Keys, keys: Keys, counts: Floats, num_threads: int = 0) -> Floats:
-    """Return the support (C,): returns in each leaf cell and its 26 neighbours, at most 65535. `counts`: at `keys`, (M,)."""
-    sums = CellBlocks(keys).neighbour_sums(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
-    return np.minimum(sums[:, 0], _MOST)
-
-
-# Measured on simulated and real scans.
+# Measured on simulated and real scans. The support of a leaf cell is the number of returns in it and its 26 neighbours.
 # Relative to the median support of the block. Cells with less are too often false to indicate that a surface continues.
 _MIN_SUPPORT = 0.5
 # Largest mean support of the two ends of a bridge. A surface crosses about nine of the 27 cells. If each of
@@ -165,7 +157,7 @@ def bridged(leaf_keys: Keys, keys: Keys, counts: Floats, max_cells: int, num_thr
     rows = CellBlocks(leaf_keys).rows(keys, num_threads)
     near = rows >= 0
     keys, counts, rows = keys[near], counts[near], rows[near]
-    of_leaves = support_at(leaf_keys, keys, counts, num_threads)
+    of_leaves = CellBlocks(keys).neighbour_sums(leaf_keys, counts[:, None], 1.0, num_threads)[:, 0]
     # Per block, not over the map: the cells added must not depend on the number of returns elsewhere.
     levels = LATTICE_BLOCK_CELLS.bit_length() - 1
     medians = block_medians(leaf_keys, of_leaves, levels, num_threads)[rows]

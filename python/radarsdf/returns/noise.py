@@ -224,8 +224,5 @@ def onto_surfels(
     planes = surfels.flat_planes_of(cells), surfels.centres, surfels.normals, thickness
     moved_onto = move_onto_planes(*of_rays, *planes, noise.of_scans(rays), kept, num_threads)
     points, directions, ranges_m = moved_onto
-    moved = dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)
-    if kept is None:
-        return moved
-    intensities = None if rays.intensities is None else rays.intensities[kept]
-    return dataclasses.replace(moved, intensities=intensities, scans=rays.scans[kept])
+    rest = rays if kept is None else rays.select(kept)
+    return dataclasses.replace(rest, points=points, directions=directions, ranges_m=ranges_m)

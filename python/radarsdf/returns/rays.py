@@ -275,18 +275,10 @@ def check_range(low: float, high: float) -> None:
     checks.check(fits, f"intensities from {low} to {high} are too far apart for float32")
 
 
-def rays_from(
-    points: Array,
-    sensors: Floats,
-    *,
-    origin: Floats,
-    intensities: Floats32 | None,
-    scans: Ints32,
-    up_of_scan: Floats,
-) -> Rays:
-    """Build rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest as in :class:`Rays`."""
+def rays_from(points: Array, sensors: Floats, origin: Floats, scans: Ints32, up_of_scan: Floats) -> Rays:
+    """Build rays without intensities from `sensors` to `points`, (N, 3) each, local frame, m. The rest as in :class:`Rays`."""
     away = points - sensors
     ranges_m = np.maximum(_lengths(away), 1e-6)
     directions = (away / ranges_m[:, None]).astype(np.float32)
     columns = points.astype(np.float32, copy=False), directions, ranges_m.astype(np.float32)
-    return Rays(origin, *columns, intensities, scans, up_of_scan, len(points))
+    return Rays(origin, *columns, None, scans, up_of_scan, len(points))

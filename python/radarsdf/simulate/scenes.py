@@ -1,7 +1,7 @@
 """Ready-made simulations: a lane among buildings, a sports court, a corner reflector on a wall, and a street."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,16 +25,14 @@ def vary(rng: np.random.Generator, material: Material) -> Material:
     return replace(material, reflectivity_db=material.reflectivity_db + rng.normal(0, 1.5))
 
 
+@dataclass
 class Site:
     """Solids on the ground. New ones must overlap neither the earlier ones nor the circles `taken`: x, y, radius [m]."""
 
-    def __init__(
-        self, rng: np.random.Generator, terrain: Terrain, taken: list[tuple[float, float, float]]
-    ) -> None:
-        self.solids: list[Primitive] = []
-        self.terrain = terrain
-        self.rng = rng
-        self._taken = list(taken)
+    rng: np.random.Generator
+    terrain: Terrain
+    taken: list[tuple[float, float, float]]
+    solids: list[Primitive] = field(default_factory=list)
 
     def fill(
         self,
@@ -108,11 +106,11 @@ class Site:
         return float(self.terrain.height(xy[None])[0])
 
     def reserve(self, circles: list[tuple[float, float, float]]) -> bool:
-        old, new = np.array(self._taken).reshape(-1, 3), np.array(circles)
+        old, new = np.array(self.taken).reshape(-1, 3), np.array(circles)
         gap = np.linalg.norm(old[:, None, :2] - new[None, :, :2], axis=2) - old[:, None, 2] - new[None, :, 2]
         if (gap < 0).any():
             return False
-        self._taken += circles
+        self.taken += circles
         return True
 
     def _block(self, xy: Floats, yaw: float, size: Floats, material: Material) -> bool:

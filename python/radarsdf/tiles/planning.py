@@ -306,8 +306,7 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     points = np.ascontiguousarray(rows["point"])
     origin = plan.config.lattice.position(tile.origin_cells)
     positions, up = (of_scans[:, :3] - origin)[scans], np.ascontiguousarray(of_scans[:, 3:6])
-    of_rays: dict[str, Any] = {"origin": origin, "intensities": None, "scans": scans.astype(np.int32)}
-    rays = rays_from(points, positions, up_of_scan=up, **of_rays)
+    rays = rays_from(points, positions, origin, scans.astype(np.int32), up)
     if plan.sensors:
         radar_of_scan = of_scans[:, 6].astype(np.int32)
         rays = dataclasses.replace(rays, sensor_of_scan=radar_of_scan, num_sensors=len(plan.radars))
