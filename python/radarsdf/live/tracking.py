@@ -34,7 +34,6 @@ from radarsdf.poses.tracking import (
     WINDOW,
     Drive,
     Tracker,
-    begin_segment,
     rates_of,
     track_drive,
 )
@@ -143,7 +142,7 @@ class Follower:
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
         self._synchronise(track, log)
-        new = Step(scan_id, logged, self._velocity(logged), begin_segment(np.eye(4)), given=False)
+        new = Step(scan_id, logged, self._velocity(logged), Tracked(np.eye(4)), given=False)
         if not self._steps:
             if len(log):
                 msg = "the map has scans, but none with a time to continue from: give the pose of the scan, and its time"
@@ -258,7 +257,7 @@ class Follower:
             for step in steps[len(steps) - new :]:
                 self._add(step)
         for scan_id, logged in track.given:
-            found = Tracked(logged.pose, _GIVEN, 1.0, 0, np.zeros(3))
+            found = Tracked(logged.pose, _GIVEN, 1.0)
             now = _now(Step(scan_id, logged, self._velocity(logged), found), log)
             if now is not None and not (self._steps and now.time_s <= self._steps[-1].time_s):
                 self._add(now)

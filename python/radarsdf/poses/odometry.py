@@ -207,7 +207,7 @@ def _estimate_jointly(
     drive: Drive, tracked: list[Tracked], segments: Ints, config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats, list[str]]:
     """Jointly estimate poses and covariances of all scans of each segment; return them with notes on open loops."""
-    poses = np.stack([found.pose for found in tracked])
+    poses, turns = (np.stack([getattr(found, name) for found in tracked]) for name in ("pose", "turn"))
     covariance, notes = np.zeros((len(poses), 6, 6)), []
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for segment in range(segments[-1] + 1):
@@ -216,7 +216,7 @@ def _estimate_jointly(
         returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m, rig)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
-        motions = drive.motions(tracked, rows)
+        motions = drive.motions(poses[rows], turns[rows][1:], rows)
         # Tracked poses are close to the truth: no short windows are needed.
         found = estimate_closed(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance

@@ -203,10 +203,14 @@ class Tracked:
     """Scan registered with planes, and its place in a tracked drive."""
 
     pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
-    covariance: Floats  # (6, 6) of the step to this scan: translation, m, rotation vector, rad, world axes
-    agreeing: float  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
-    segment: int  # number of its segment of the drive
-    turn: Floats  # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn
+    # (6, 6) of the step to this scan: translation, m, rotation vector, rad, world axes.
+    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    agreeing: float = (
+        np.nan
+    )  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
+    segment: int = 0  # number of its segment of the drive
+    # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn.
+    turn: Floats = field(default_factory=lambda: np.zeros(3))
     # Share of the predicted variance that the returns removed, of translation and rotation, in the least certain direction.
     observed: tuple[float, float] = (0.0, 0.0)
 
@@ -253,7 +257,7 @@ class PlaneMap:
         covariance = self._discount_chance(scan, pose, prior, np.linalg.inv(total))
         moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
         observed = moved_share, _removed_share(prior[3:, 3:], covariance[3:, 3:])
-        return Tracked(pose, covariance, inliers / len(scan), 0, np.zeros(3), observed)
+        return Tracked(pose, covariance, inliers / len(scan), observed=observed)
 
     def _discount_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
         """Remove the spurious information along the least certain axis that returns have for any shift of the scan."""
