@@ -372,14 +372,13 @@ class Follower:
             return [self._next(new, sign)]
         frame = steps[first].found.pose
         both = np.kron(np.eye(2), frame[:3, :3])
-        placed = [
-            dataclasses.replace(one, pose=frame @ one.pose, covariance=both @ one.covariance @ both.T)
-            for one in tracked[1:]
-        ]
-        return [
-            dataclasses.replace(step, found=found, sign=sign)
-            for step, found in zip(steps[first + 1 :], placed, strict=True)
-        ]
+        found = []
+        for step, one in zip(steps[first + 1 :], tracked[1:], strict=True):
+            placed = dataclasses.replace(
+                one, pose=frame @ one.pose, covariance=both @ one.covariance @ both.T
+            )
+            found.append(dataclasses.replace(step, found=placed, sign=sign))
+        return found
 
     def _followed(self, steps: list[Step], sign: int) -> tuple[int, list[Tracked]]:
         """Return the sign of the Doppler, 0 if not significant, and the scans tracked by odometry, in the frame of the first."""

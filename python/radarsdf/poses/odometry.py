@@ -300,9 +300,8 @@ class PosedScans:
     rows: slice  # the K scans among those of the drive: all, or the longest segment of odometry
     given: Floats | None = None  # (K, 4, 4) original poses, if any
     segments: int = 1
-    trajectory: dict[str, Any] | None = (
-        None  # for the report of a map, as JSON values. None for original poses
-    )
+    # For the report of a map, as JSON values. None for original poses.
+    trajectory: dict[str, Any] | None = None
     sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
     notes: tuple[str, ...] = ()  # sentences on unused input
 

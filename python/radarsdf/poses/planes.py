@@ -205,9 +205,7 @@ class Tracked:
     pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
     # (6, 6) of the step to this scan: translation, m, rotation vector, rad, world axes.
     covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    agreeing: float = (
-        np.nan
-    )  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
+    agreeing: float = np.nan  # share of inliers on planes of previous scans. NaN if it starts a segment
     segment: int = 0  # number of its segment of the drive
     # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn.
     turn: Floats = field(default_factory=lambda: np.zeros(3))
@@ -277,9 +275,11 @@ class PlaneMap:
     def information_by_chance(self, scans: Sequence[Floats], poses: Floats) -> tuple[Floats, float]:
         """Return the axis (3,) along which scans (N_i, 3) at `poses` (F, 4, 4) are least certain, and the share of their
         information there that any shifted scans have, too."""
-        hessian = np.sum([self.normal_equations(s, p)[0] for s, p in zip(scans, poses, strict=True)], axis=0)
-        axis = np.linalg.eigh(hessian[:3, :3])[1][:, 0]
+        axis = np.linalg.eigh(self._information(scans, poses)[:3, :3])[1][:, 0]
         return axis, self._chance(scans, poses, axis)
+
+    def _information(self, scans: Sequence[Floats], poses: Floats) -> Floats:
+        return np.sum([self.normal_equations(s, p)[0] for s, p in zip(scans, poses, strict=True)], axis=0)
 
     def _chance(self, scans: Sequence[Floats], poses: Floats, axis: Floats) -> float:
         """Return the information along `axis` (3,) of shifted scans, relative to that of scans at `poses` (F, 4, 4)."""
@@ -287,9 +287,7 @@ class PlaneMap:
         for shift in _SHIFTS:
             shifted = poses.copy()
             shifted[:, :3, 3] += _CELLS[-1] * self.cell_size_m * shift * axis
-            hessian = np.sum(
-                [self.normal_equations(s, p)[0] for s, p in zip(scans, shifted, strict=True)], axis=0
-            )
+            hessian = self._information(scans, shifted)
             variance = axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis
             information.append(1 / float(variance) if variance > 0 else 0.0)
         return min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))

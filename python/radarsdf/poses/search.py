@@ -358,9 +358,8 @@ def search_near(
         found = _Places.of(index, submap, starts, guess)
         k = found.best
         if k in found.elsewhere(0) and found.refusal(k) is None:
-            msg = (
-                f"the scans agree better with the map at {found.names[k]} than at the guess, {found.names[0]}"
-            )
+            at = found.names
+            msg = f"the scans agree better with the map at {at[k]} than at the guess, {at[0]}"
             raise found.lost(msg, k, 0)
         rival = found.rival(0)
         if rival is None:
@@ -485,9 +484,8 @@ def _clearly_better(scores: Floats, others: Floats, chance: float, blocks: Ints)
     counts = np.bincount(blocks)
     gains = np.bincount(blocks, scores - others) / counts
     mean = np.average(gains, weights=counts)
-    error = (
-        np.sqrt(((counts * (gains - mean)) ** 2).sum() * len(counts) / max(len(counts) - 1, 1)) / counts.sum()
-    )
+    squares = ((counts * (gains - mean)) ** 2).sum() * len(counts) / max(len(counts) - 1, 1)
+    error = np.sqrt(squares) / counts.sum()
     # An object agrees at the true place unless it changed (share c), and elsewhere by chance (q). One that agrees only at the
     # first place has the likelihood (1 - c) (1 - q) if that is the true one, else c q.
     changed, chance = np.clip([1 - scores.mean(), chance], 1e-2, 1 - 1e-2)
