@@ -24,19 +24,10 @@ from radarsdf.poses.doppler import (
     upright,
 )
 from radarsdf.poses.motion import MotionRate, PredictedStep
-from radarsdf.poses.planes import Tracked, plane_cell_m
+from radarsdf.poses.planes import LEAST_OBSERVED, Tracked, plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.search import Lost
-from radarsdf.poses.tracking import (
-    LEAST_OBSERVED,
-    MOVES,
-    TURNS,
-    WINDOW,
-    Drive,
-    Tracker,
-    rates_of,
-    track_drive,
-)
+from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Tracker, rates_of, track_drive
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.rig import Label, Rig
 
@@ -252,10 +243,11 @@ class Follower:
         new = next((more for more in (0, 1) if self._complete and self._continued_by(steps, more)), None)
         self._complete = False
         if new is None:
-            self._begin(steps)
-        else:
-            for step in steps[len(steps) - new :]:
-                self._add(step)
+            self._steps.clear()
+            self._rates.clear()
+            new = len(steps)
+        for i, step in enumerate(steps[len(steps) - new :]):
+            self._add(step, planes=new - i <= WINDOW * self.num_radars)
         for scan_id, logged in track.given:
             found = Tracked(logged.pose, _GIVEN, 1.0)
             now = _now(Step(scan_id, logged, self._velocity(logged), found), log)
@@ -268,13 +260,6 @@ class Follower:
         before = [*self._steps][max(0, len(self._steps) + new - _STEPS * self.num_radars) :]
         poses = ([step.found.pose for step in each] for each in (before, steps[: len(steps) - new]))
         return len(before) + new == len(steps) and all(map(operator.is_, *poses))
-
-    def _begin(self, steps: Sequence[Step]) -> None:
-        """Reset to the state after only these scans."""
-        self._steps.clear()
-        self._rates.clear()
-        for i, step in enumerate(steps):
-            self._add(step, planes=i >= len(steps) - WINDOW * self.num_radars)
 
     def _add(self, step: Step, *, planes: bool = True) -> None:
         if self._steps:
@@ -308,15 +293,9 @@ class Follower:
         steps = [*list(self._steps)[-2 * self.num_radars :], new]
         durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
         turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
-        drive = Drive(
-            [step.scan for step in steps],
-            np.array([step.time_s for step in steps]),
-            self._velocities(steps, sign),
-            None,
-            TURNS.learnt(turns, durations_s),
-            MOVES.learnt(moves, durations_s),
-            rig=_rig_of(steps),
-        )
+        scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
+        priors = TURNS.learnt(turns, durations_s), MOVES.learnt(moves, durations_s)
+        drive = Drive(scans, times_s, self._velocities(steps, sign), None, *priors, rig=_rig_of(steps))
         turn, move = self._rates[-1] if self._rates else (None, None)
         expected = drive.predict(len(steps) - 1, turn, move)
         found = self._tracker.register(drive.scans[-1], expected)

@@ -303,7 +303,8 @@ class _Anchor:
         for scan, pose in zip(scans, poses, strict=True):
             rays = np.einsum("ij,nj->ni", pose[:3, :3], scan)
             # Thin walls and trunks have two sides, of which the map may show the other one.
-            seen = np.einsum("ni,ni->n", rays, index.normals_at(rays + pose[:3, 3])) < 0
+            normals = index.surface.normals[index.tree.query(rays + pose[:3, 3])[1]]
+            seen = np.einsum("ni,ni->n", rays, normals) < 0
             facing.append(np.ascontiguousarray(scan[seen]))
             cells.append(np.floor((rays[seen] + pose[:3, 3]) / (3 * index.cell_m)))
         number = sum(map(len, facing))

@@ -17,10 +17,10 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import NOT_USED, BodyVelocities
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
-from radarsdf.poses.planes import SensorReturns, Tracked, plane_cell_m
+from radarsdf.poses.planes import LEAST_OBSERVED, SensorReturns, Tracked, plane_cell_m
 from radarsdf.poses.refine import RefinedPoses, estimate_closed
 from radarsdf.poses.rigid import lengths_of_steps_m, steps
-from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
+from radarsdf.poses.tracking import LATERAL_MPS2, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.rig import Imu
 from radarsdf.scans import Scans, filled

@@ -195,6 +195,9 @@ _SETTLED = 0.3, 0.03  # tolerances at these, standard deviations: coarse cells o
 _MOST_RETURNS = 2000  # of a scan
 _LEAST_VARIANCE = 1e-12  # of a prior, m² and rad²
 _SHIFTS = 0.0, 1.0, -1.0, 2.0, -2.0  # cells, beyond the extent of single objects
+# Minimum share of a step's prior variance that the returns must remove if nothing else measures the translation. Below half,
+# the prior is more informative. Simulated walls: 0.08 and 0.10; all other scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
+LEAST_OBSERVED = 0.5
 _SURE = 0.05  # standard deviation of a translation of the prior that needs no returns, cells
 
 

@@ -184,14 +184,6 @@ class SurfaceIndex:
         planes.add(points[np.isfinite(within)])
         return planes
 
-    def normals_at(self, points: Floats) -> Floats:
-        """Return the normals (N, 3) of the surface nearest to points (N, 3)."""
-        return self.surface.normals[self._tree.query(points)[1]]
-
-    def covers(self, points: Floats, reach_m: float) -> Bools:
-        """Return a mask (N,) of points (N, 3) within `reach_m` of the surface."""
-        return np.isfinite(self._tree.query(points, distance_upper_bound=reach_m)[0])
-
     def outlines(self, points: Floats, margin_m: float) -> Bools:
         """Return a mask of points (..., 3) that are, seen from above, within the convex outline of the map."""
         # Unit normals and offsets of the edges; a point is inside where all n · x + offset ≤ 0.
@@ -203,7 +195,7 @@ class SurfaceIndex:
         return ConvexHull(self.surface.points[:, :2], qhull_options="QJ")
 
     @cached_property
-    def _tree(self) -> cKDTree:
+    def tree(self) -> cKDTree:
         return cKDTree(self.surface.points)
 
     @cached_property
@@ -456,7 +448,8 @@ class _Places:
 
     def covered(self, place: int) -> float:
         """Return the share of the points that have a surface of the map near them."""
-        return float(self.index.covers(self.points_at(place), self.capture_m).mean())
+        distances_m, _ = self.index.tree.query(self.points_at(place), distance_upper_bound=self.capture_m)
+        return float(np.isfinite(distances_m).mean())
 
     def rival(self, place: int) -> int | None:
         """Return another place with which the submap does not clearly agree less."""

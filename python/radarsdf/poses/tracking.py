@@ -59,10 +59,8 @@ class Tracker:
     _recent: deque[tuple[Floats, Floats, Floats]] = field(default_factory=deque)
     _scans: int = 0
 
-    def register(self, scan: Floats, predicted: PredictedStep | None) -> Tracked:
-        """Register a scan (N, 3), sensor frame, m, with the map, near the predicted step. None: the first scan."""
-        if predicted is None or not self._scans:
-            return Tracked(np.eye(4))
+    def register(self, scan: Floats, predicted: PredictedStep) -> Tracked:
+        """Register a scan (N, 3), sensor frame, m, with the map, near the predicted step."""
         scan = thin(scan)
         if len(scan) == 0:
             return self._dead_reckon(predicted)
@@ -164,9 +162,6 @@ _PASSES = 3
 # Initial priors, until the drive's own rates replace them. With 1 rad/s, first steps of sparse real scans were wrong by up to 9 degrees.
 TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
-# Minimum share of a step's prior variance that the returns must remove if nothing else measures the translation. Below half,
-# the prior is more informative. Simulated walls: 0.08 and 0.10; all other scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
-LEAST_OBSERVED = 0.5
 # Standard deviation of the lateral acceleration: at high speed, turns are slow. Vehicles on roads: about 1; drones and hands: 2.
 LATERAL_MPS2 = 2.0
 # Maximum standard deviation of a turn rate that may remain unobserved between scans, that of a sensor faster than 20 m/s: the joint
@@ -294,7 +289,7 @@ def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rate
     last: Rates = None, None
     for i, scan in enumerate(drive.scans):
         predicted = drive.predict(i, *last) if i else None
-        now = tracker.register(scan, predicted)
+        now = Tracked(np.eye(4)) if predicted is None else tracker.register(scan, predicted)
         tracker.add(scan, now)
         if predicted is not None:
             before, duration_s = tracked[-1], predicted.duration_s
