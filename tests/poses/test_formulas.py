@@ -26,7 +26,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import Drive, Tracked, begin_segment, rates_of
+from radarsdf.poses.tracking import Drive, Tracked, rates_of
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
 from scipy.stats import t as student
@@ -236,11 +236,8 @@ def test_standard_deviations_of_poses_become_settings_of_returns():
 def test_motions_of_a_tracked_drive():
     poses = trajectory(5)
     rotation_vectors = np.stack([rotation_vector(step[:3, :3]) for step in between(poses[:-1], poses[1:])])
-    tracked = [begin_segment(poses[0])] + [
-        Tracked(p, np.eye(6), 1.0, 0, t) for p, t in zip(poses[1:], rotation_vectors, strict=True)
-    ]
     drive = Drive([np.zeros((0, 3))] * 5, 0.5 * np.arange(5.0), None, None)
-    (motion,) = drive.motions(tracked, slice(0, 5))
+    (motion,) = drive.motions(poses, rotation_vectors, slice(0, 5))
     rates = step_vectors(poses) / 0.5
     middle, variance = drive.moves.conditional(rates[:, :3], np.full(4, 0.5))
     off, expected = motion.errors(poses)[:, :3], 0.5 * (rates[:, :3] - middle)
@@ -254,7 +251,7 @@ def test_motions_of_a_tracked_drive():
         2 * rotation_vectors, np.full(4, 0.5), MotionRate(np.zeros(3), np.diag([1.0, 4, 9]) * 1e-4)
     )
     with_both = dataclasses.replace(drive, velocities=velocities, gyroscope=gyroscope)
-    turning, steady, moving = with_both.motions(tracked, slice(1, 4))
+    turning, steady, moving = with_both.motions(poses[1:4], rotation_vectors[1:3], slice(1, 4))
     assert np.isinf(steady.shares).all()
     assert np.isinf(steady.evidence().shares).all()
     assert_allclose(turning.steps[:, :3, :3], rotation(2 * rotation_vectors[1:3]))

@@ -24,20 +24,10 @@ from radarsdf.poses.doppler import (
     upright,
 )
 from radarsdf.poses.motion import MotionRate, PredictedStep
-from radarsdf.poses.planes import Tracked, plane_cell_m
+from radarsdf.poses.planes import LEAST_OBSERVED, Tracked, plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.search import Lost
-from radarsdf.poses.tracking import (
-    LEAST_OBSERVED,
-    MOVES,
-    TURNS,
-    WINDOW,
-    Drive,
-    Tracker,
-    begin_segment,
-    rates_of,
-    track_drive,
-)
+from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Tracker, rates_of, track_drive
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.rig import Label, Rig
 
@@ -138,7 +128,7 @@ class Follower:
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
         self._synchronise(track, log)
-        new = Step(scan_id, logged, self._velocity(logged), begin_segment(np.eye(4)), given=False)
+        new = Step(scan_id, logged, self._velocity(logged), Tracked(np.eye(4)), given=False)
         if not self._steps:
             if len(log):
                 msg = "the map has scans, but none with a time to continue from: give the pose of the scan, and its time"
@@ -254,7 +244,7 @@ class Follower:
         for i in range(len(steps) - new, len(steps)):
             self._add(steps[i], planes=i >= len(steps) - WINDOW * self.num_radars)
         for scan_id, logged in track.given:
-            found = Tracked(logged.pose, _GIVEN, 1.0, 0, np.zeros(3))
+            found = Tracked(logged.pose, _GIVEN, 1.0)
             now = _now(Step(scan_id, logged, self._velocity(logged), found), log)
             if now is not None and not (self._steps and now.time_s <= self._steps[-1].time_s):
                 self._add(now)
@@ -298,15 +288,9 @@ class Follower:
         steps = [*list(self._steps)[-2 * self.num_radars :], new]
         durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
         turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
-        drive = Drive(
-            [step.scan for step in steps],
-            np.array([step.time_s for step in steps]),
-            self._velocities(steps, sign),
-            None,
-            TURNS.learnt(turns, durations_s),
-            MOVES.learnt(moves, durations_s),
-            rig=_rig_of(steps),
-        )
+        scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
+        priors = TURNS.learnt(turns, durations_s), MOVES.learnt(moves, durations_s)
+        drive = Drive(scans, times_s, self._velocities(steps, sign), None, *priors, rig=_rig_of(steps))
         turn, move = self._rates[-1] if self._rates else (None, None)
         expected = drive.predict(len(steps) - 1, turn, move)
         found = self._tracker.register(drive.scans[-1], expected)

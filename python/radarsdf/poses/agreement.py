@@ -1,7 +1,7 @@
 """Agreement of returns of different scans, and its significance."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -140,13 +140,11 @@ class Agreement:
         """Median distance between neighbouring returns of scan i, m; 0 if it has too few."""
         return float(np.median(self._of(i).spacing_m)) if len(self._scans[i]) >= MIN_RETURNS else 0.0
 
-    def _both_ways(self, i: int, j: int, T_j_i: Floats) -> list[tuple[Floats, _Indexed]]:
-        """Returns (H, M, 3) of each of two scans in the frame of the other one, and this one."""
-        found = []
+    def _both_ways(self, i: int, j: int, T_j_i: Floats) -> Iterator[tuple[Floats, _Indexed]]:
+        """Yield the returns (H, M, 3) of each of two scans in the frame of the other one, and this one."""
         for k, other, T in ((i, j, T_j_i), (j, i, np.asarray(np.linalg.inv(T_j_i), np.float64))):
             points = np.einsum("hab,nb->hna", T[:, :3, :3], self._of(k).queries) + T[:, None, :3, 3]
-            found.append((points, self._of(other)))
-        return found
+            yield points, self._of(other)
 
     def _of(self, i: int) -> _Indexed:
         if i not in self._indexed:

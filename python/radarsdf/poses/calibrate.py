@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from radarsdf._core import CommonPlanes
 from radarsdf.arrays import Floats, Ints, Ints32
-from radarsdf.checks import instance
+from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import LEAST_MPS, SensorVelocities
@@ -360,12 +360,11 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     """
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     rig, limits = instance(scans, Scans, "scans").rig, config.returns
-    if rig is None or len(np.unique(rig.of_scan)) < 2:
-        msg = "calibrate needs scans of several radars: Scans(..., sensors=labels)"
-        raise ValueError(msg)
-    if (times_s := scans.times_s) is None:
-        msg = "times_s are missing: the time of each scan, s"
-        raise ValueError(msg)
+    several = rig is not None and len(np.unique(rig.of_scan)) > 1
+    check(several, "calibrate needs scans of several radars: Scans(..., sensors=labels)")
+    check((times_s := scans.times_s) is not None, "times_s are missing: the time of each scan, s")
+    assert rig is not None
+    assert times_s is not None
     order = np.argsort(times_s, kind="stable")
     scans, rig, times_s = scans.select(order), rig.select(order), times_s[order]
     labels, reference, mountings = rig.labels, int(rig.of_scan[0]), rig.T_body_sensor

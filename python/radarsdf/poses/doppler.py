@@ -56,10 +56,8 @@ class SensorVelocities:
         each = sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
         if 2 * found.sum() < max(len(found), 2):
-            msg = (
-                f"{found.sum()} of {len(found)} scans agree on a velocity of the sensor: at least {MIN_DOPPLER_RETURNS} returns with "
-                "Doppler in m/s, of which 40 % agree"
-            )
+            needed = f"at least {MIN_DOPPLER_RETURNS} returns with Doppler in m/s, of which 40 % agree"
+            msg = f"{found.sum()} of {len(found)} scans agree on a velocity of the sensor: {needed}"
             raise NoVelocityError(msg)
         means = np.stack([velocity.velocity_mps for velocity in each])
         covariance = np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3)

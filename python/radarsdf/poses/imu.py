@@ -378,10 +378,10 @@ class Inertial:
         rate = float(np.median(np.linalg.norm(imu.angular_velocity, axis=1)))
         across = rate * (0.0 if velocities is None else velocities.usual_mps)
         if rate > _MOST_RAD_S or across > _MOST_MPS2:
-            measured = (
-                f"{rate:.3g} rad/s, {across:.0f} m/s² across the trajectory. They may be in deg/s: give rad/s"
+            measured = f"{rate:.3g} rad/s, {across:.0f} m/s² across the trajectory"
+            return cls(None).without(
+                f"the median of its rates is {measured}. They may be in deg/s: give rad/s"
             )
-            return cls(None).without(f"the median of its rates is {measured}")
         imu = replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             return cls(None).without("it measured before or after all scans. Are both times of one clock?")

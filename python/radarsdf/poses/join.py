@@ -70,10 +70,8 @@ def join(sessions: Sequence[Scans], *, config: FitConfig | None = None) -> Joine
     verdicts: dict[tuple[int, int], str] = {}
     transforms: dict[int, Floats] = {0: np.eye(4)}
     with ThreadPool(config.num_threads) as pool:
-        indices = [
-            SurfaceIndex.of_returns(one.returns, one.poses, config.leaf_size_m, pool.num_threads)
-            for one in placed
-        ]
+        cells = config.leaf_size_m, pool.num_threads
+        indices = [SurfaceIndex.of_returns(one.returns, one.poses, *cells) for one in placed]
         found: dict[tuple[int, int], Floats] = {}
         for i, k in itertools.combinations(range(len(placed)), 2):
             try:
@@ -89,15 +87,9 @@ def join(sessions: Sequence[Scans], *, config: FitConfig | None = None) -> Joine
         poses = [np.full((len(session), 4, 4), np.nan) for session in sessions]
         for k, refined in zip(together, _refine(placed, transforms, config, pool.num_threads), strict=True):
             poses[k][placed[k].rows] = refined
-    words = f"{len(together)} of {len(sessions)} sessions are in one frame."
-    others = [
-        f"sessions {i} and {k} are {verdict}" for (i, k), verdict in verdicts.items() if verdict != JOINED
-    ]
-    report = {
-        "verdict": " ".join([words, *[f"{other.capitalize()}." for other in others]]),
-        "joined": together,
-        "seconds": time.perf_counter() - begin,
-    }
+    words = [f"{len(together)} of {len(sessions)} sessions are in one frame."]
+    words += [f"Sessions {i} and {k} are {of}." for (i, k), of in verdicts.items() if of != JOINED]
+    report = {"verdict": " ".join(words), "joined": together, "seconds": time.perf_counter() - begin}
     return Joined(poses, verdicts, report)
 
 
@@ -132,19 +124,17 @@ def _refine(
     sessions, before = [placed[k] for k in together], np.concatenate(poses)
     if len(sessions) == 1:
         return poses
-    ends = np.cumsum([len(one) for one in poses])
-    numbers = [
-        one.returns.scans + np.int32(end - len(one.poses)) for one, end in zip(sessions, ends, strict=True)
-    ]
+    begins = np.cumsum([0, *map(len, poses)])
+    numbers = [one.returns.scans + np.int32(k) for one, k in zip(sessions, begins[:-1], strict=True)]
     parts = [(one.returns.directions, one.returns.ranges_m) for one in sessions]
     directions, ranges_m = (np.concatenate(part) for part in zip(*parts, strict=True))
     returns = SensorReturns(directions, ranges_m, np.concatenate(numbers))
     sigmas = np.max([FIRST_SIGMAS, *[unsteadiness(one, None) for one in poses]], axis=0).tolist()
     motion = Motion.of(before, *sigmas)
-    motion.shares[ends[:-1] - 1] = np.inf  # from one session to the next
+    motion.shares[begins[1:-1] - 1] = np.inf  # from one session to the next
     cell_m = plane_cell_m([scan for one in sessions for scan in one.scans], config.leaf_size_m)
     found = PosesEstimate.of(returns, before, [motion], cell_m, config.returns, num_threads, len(before))
     # The first session keeps its frame.
-    first = found.poses[: ends[0]]
+    first = found.poses[: begins[1]]
     whole = aligned(first, poses[0])[0] @ np.linalg.inv(first[0])
-    return np.split(np.einsum("ij,fjk->fik", whole, found.poses), ends[:-1])
+    return np.split(np.einsum("ij,fjk->fik", whole, found.poses), begins[1:-1])

@@ -1,6 +1,5 @@
 """Localisation of scans in a map made before."""
 
-import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -25,9 +24,8 @@ from radarsdf.rig import Imu
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
-_FINE_CELLS = (
-    0.5  # cells of planes for the last estimate: larger ones bend poles and corners, 4 to 17 cm, not 1 to 6
-)
+# Cells of planes for the last estimate: larger ones bend poles and corners, 4 to 17 cm, not 1 to 6.
+_FINE_CELLS = 0.5
 _FEWEST = 6  # scans to search
 # Least agreement of a part of the drive that is where it seems, relative to that found first. Of a part after a jump of 20 m, fitted to
 # other surfaces: 0.64; of others 0.8 to 1.
@@ -205,16 +203,12 @@ class _Localiser:
             information = anchor(poses)[0] + WEAK * np.eye(6)
             covariance = np.linalg.inv(information).astype(np.float64)
         else:
-            placed = [
-                dataclasses.replace(self.tracked[i], pose=pose) for i, pose in zip(rows, poses, strict=True)
-            ]
-            whole = [*self.tracked[: rows[0]], *placed, *self.tracked[rows[-1] + 1 :]]
-            motions = self.drive.motions(whole, slice(rows[0], rows[-1] + 1))
+            turns = np.stack([self.tracked[i].turn for i in rows[1:]])
+            motions = self.drive.motions(poses, turns, slice(rows[0], rows[-1] + 1))
             returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
             cell_m = plane_cell_m(scans, self.config.leaf_size_m)
-            found = PosesEstimate.of(
-                returns, poses, motions, cell_m, limits, self.num_threads, len(rows), False, anchor
-            )
+            options = motions, cell_m, limits, self.num_threads, len(rows), False, anchor
+            found = PosesEstimate.of(returns, poses, *options)
             poses, covariance = found.poses, found.covariance
         if undecided:
             covariance = covariance + _as_guessed(poses)
@@ -309,7 +303,8 @@ class _Anchor:
         for scan, pose in zip(scans, poses, strict=True):
             rays = np.einsum("ij,nj->ni", pose[:3, :3], scan)
             # Thin walls and trunks have two sides, of which the map may show the other one.
-            seen = np.einsum("ni,ni->n", rays, index.normals_at(rays + pose[:3, 3])) < 0
+            normals = index.surface.normals[index.tree.query(rays + pose[:3, 3])[1]]
+            seen = np.einsum("ni,ni->n", rays, normals) < 0
             facing.append(np.ascontiguousarray(scan[seen]))
             cells.append(np.floor((rays[seen] + pose[:3, 3]) / (3 * index.cell_m)))
         number = sum(map(len, facing))

@@ -31,7 +31,7 @@ _PASSES = 3  # of Gauss-Newton, coarse to fine
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
     """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted."""
-    revisited = visits(returns, poses)
+    revisited = list(visits(returns, poses))
     if not revisited:
         return []
     returns = returns.every(-(-len(returns) // _MOST_RETURNS))
@@ -79,11 +79,8 @@ def close_loop(
     later, earlier = visit
     path_m, range_m = _path_m(poses), float(np.median(returns.ranges_m))
     later = np.arange(max(later[-1] - _SCANS + 1, 0), later[-1] + 1)
-    own, begin_m, between_m = (
-        poses[later[len(later) // 2]],
-        path_m[earlier[-1]],
-        path_m[later[0]] - path_m[earlier[-1]],
-    )
+    own, begin_m = poses[later[len(later) // 2]], path_m[earlier[-1]]
+    between_m = path_m[later[0]] - begin_m
     # Scans just before the visit drifted with it.
     before = path_m < min(begin_m + _AFTER * range_m, path_m[later[0]] - _BEFORE * range_m)
     before &= np.linalg.norm(poses[:, :3, 3] - own[:3, 3], axis=1) < _NEAR * range_m
@@ -112,18 +109,15 @@ def close_loop(
     return moved(poses, np.concatenate([moved_m, turned], axis=1))
 
 
-def visits(returns: SensorReturns, poses: Floats) -> list[tuple[Ints, Ints]]:
-    """Return the scans of each later visit of a place, and those of earlier ones."""
-    return list(_visits(poses[:, :3, 3], _path_m(poses), float(np.median(returns.ranges_m))))
-
-
 def _path_m(poses: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(lengths_of_steps_m(poses))])
 
 
-def _visits(positions: Floats, path_m: Floats, range_m: float) -> Iterator[tuple[Ints, Ints]]:
+def visits(returns: SensorReturns, poses: Floats) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the scans of each later visit of a place, and those of earlier ones."""
+    path_m, range_m = _path_m(poses), float(np.median(returns.ranges_m))
     _, first, part = np.unique(np.floor(path_m / (_PART * range_m)), return_index=True, return_inverse=True)
-    pairs = cKDTree(positions[first]).query_pairs(_SAME_PLACE * range_m, output_type="ndarray")
+    pairs = cKDTree(poses[first, :3, 3]).query_pairs(_SAME_PLACE * range_m, output_type="ndarray")
     pairs = pairs[path_m[first[pairs[:, 1]]] - path_m[first[pairs[:, 0]]] > _AWAY * range_m]
     later = np.unique(pairs[:, 1])
     runs = np.split(later, np.flatnonzero(np.diff(later) > 1) + 1) if len(later) else []

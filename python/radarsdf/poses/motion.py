@@ -66,10 +66,9 @@ class MotionPrior:
         usual = (_PRIOR_STEPS * self.usual + np.sum(known, axis=0)) / (_PRIOR_STEPS + len(known))
         elapsed_s = (durations_s[:-1] + durations_s[1:]) / 2
         changes = [
-            ((second.mean - first.mean) ** 2 + errors * (first.covariance + second.covariance).diagonal())
-            / after_s
-            for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False)
-            if first is not None and second is not None and after_s > 0
+            ((b.mean - a.mean) ** 2 + errors * (a.covariance + b.covariance).diagonal()) / after_s
+            for a, b, after_s in zip(rates, rates[1:], elapsed_s, strict=False)
+            if a is not None and b is not None and after_s > 0
         ]
         change = (_PRIOR_STEPS * self.change + np.sum(changes, axis=0)) / (_PRIOR_STEPS + len(changes))
         return MotionPrior(usual, change, self.settles)
@@ -293,9 +292,7 @@ class SteadyMotion(KnownMotion):
     def evidence(self) -> Motion:
         """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""
         shares = np.where(np.isinf(self.shares), np.inf, self.spans[:, None])
-        return Motion(
-            self.steps, shares, self.spans, variances=self.usual, bias=self.bias, bias_sigma=self.bias_sigma
-        )
+        return Motion(self.steps, shares, self.spans, variances=self.usual, bias_sigma=self.bias_sigma)
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:

@@ -17,10 +17,10 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import NOT_USED, BodyVelocities
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
-from radarsdf.poses.planes import SensorReturns, Tracked, plane_cell_m
+from radarsdf.poses.planes import LEAST_OBSERVED, SensorReturns, Tracked, plane_cell_m
 from radarsdf.poses.refine import RefinedPoses, estimate_closed
 from radarsdf.poses.rigid import lengths_of_steps_m, steps
-from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
+from radarsdf.poses.tracking import LATERAL_MPS2, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.rig import Imu
 from radarsdf.scans import Scans, filled
@@ -207,7 +207,7 @@ def _estimate_jointly(
     drive: Drive, tracked: list[Tracked], segments: Ints, config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats, list[str]]:
     """Jointly estimate poses and covariances of all scans of each segment; return them with notes on open loops."""
-    poses = np.stack([found.pose for found in tracked])
+    poses, turns = (np.stack([getattr(found, name) for found in tracked]) for name in ("pose", "turn"))
     covariance, notes = np.zeros((len(poses), 6, 6)), []
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for segment in range(segments[-1] + 1):
@@ -216,7 +216,7 @@ def _estimate_jointly(
         returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m, rig)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
-        motions = drive.motions(tracked, rows)
+        motions = drive.motions(poses[rows], turns[rows][1:], rows)
         # Tracked poses are close to the truth: no short windows are needed.
         found = estimate_closed(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance
@@ -300,9 +300,8 @@ class PosedScans:
     rows: slice  # the K scans among those of the drive: all, or the longest segment of odometry
     given: Floats | None = None  # (K, 4, 4) original poses, if any
     segments: int = 1
-    trajectory: dict[str, Any] | None = (
-        None  # for the report of a map, as JSON values. None for original poses
-    )
+    # For the report of a map, as JSON values. None for original poses.
+    trajectory: dict[str, Any] | None = None
     sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
     notes: tuple[str, ...] = ()  # sentences on unused input
 

@@ -1,11 +1,12 @@
 """Search for the place of a submap of several scans in a whole map."""
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import fft
@@ -149,16 +150,11 @@ class SurfaceIndex:
         points, normals = mesh.vertices - origin, np.asarray(mesh.vertex_normals, np.float64)
         # Planes have errors of the map, and do not fit bends.
         rows = np.linspace(0, len(points) - 1, _SAMPLED).astype(np.int64)
-        _, near = cKDTree(points).query(points[rows], _NEIGHBOURS)
-        off_m = np.einsum(
-            "ni,nki->nk", normals[rows], points[np.minimum(near, len(points) - 1)] - points[rows, None]
-        )
-        sigma_m = float(
-            np.hypot(
-                np.nanmedian(np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)), off_m.std()
-            )
-        )
-        return cls(OrientedPoints(points, normals, sigma_m), LEAVES_PER_SURFEL * leaf_m, origin)
+        near = np.minimum(cKDTree(points).query(points[rows], _NEIGHBOURS)[1], len(points) - 1)
+        off_m = np.einsum("ni,nki->nk", normals[rows], points[near] - points[rows, None])
+        uncertainty_m = np.nanmedian(np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64))
+        surface = OrientedPoints(points, normals, float(np.hypot(uncertainty_m, off_m.std())))
+        return cls(surface, LEAVES_PER_SURFEL * leaf_m, origin)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write an ``.npz`` file for :meth:`load`, atomically."""
@@ -180,47 +176,34 @@ class SurfaceIndex:
 
     def near(self, middles: Floats, reach_m: float, cells: float = 1.0) -> PlaneMap:
         """Build the planes of the surface within `reach_m` of places (K, 3)."""
-        planes, points = PlaneMap(cells * self.cell_m), self.surface.points
-        x, y = points[:, 0], points[:, 1]
-        (left, lower), (right, upper) = (
-            middles[:, :2].min(axis=0) - reach_m,
-            middles[:, :2].max(axis=0) + reach_m,
-        )
+        planes, points, middles = PlaneMap(cells * self.cell_m), self.surface.points, middles[:, :2]
+        lower, upper = middles.min(axis=0) - reach_m, middles.max(axis=0) + reach_m
         # A query for all points of a square kilometre takes seconds.
-        points = points[(x >= left) & (x <= right) & (y >= lower) & (y <= upper)]
-        within, _ = cKDTree(middles[:, :2]).query(points[:, :2], distance_upper_bound=reach_m)
+        points = points[((points[:, :2] >= lower) & (points[:, :2] <= upper)).all(axis=1)]
+        within, _ = cKDTree(middles).query(points[:, :2], distance_upper_bound=reach_m)
         planes.add(points[np.isfinite(within)])
         return planes
 
-    def normals_at(self, points: Floats) -> Floats:
-        """Return the normals (N, 3) of the surface nearest to points (N, 3)."""
-        return self.surface.normals[self._tree.query(points)[1]]
-
-    def covers(self, points: Floats, reach_m: float) -> Bools:
-        """Return a mask (N,) of points (N, 3) within `reach_m` of the surface."""
-        return np.isfinite(self._tree.query(points, distance_upper_bound=reach_m)[0])
-
     def outlines(self, points: Floats, margin_m: float) -> Bools:
         """Return a mask (N,) of points (N, 3) that are, seen from above, within the convex outline of the map."""
-        edges = self._outline
+        # Unit normals and offsets of the edges; a point is inside where all n · x + offset ≤ 0.
+        edges = self._outline.equations
         return np.asarray((points[:, :2] @ edges[:, :2].T + edges[:, 2] <= margin_m).all(axis=1))
 
     @cached_property
-    def _outline(self) -> Floats:
-        """(E, 3) unit normals and offsets of the edges; a point is inside where all n · x + offset ≤ 0."""
-        return ConvexHull(self.surface.points[:, :2], qhull_options="QJ").equations
+    def _outline(self) -> ConvexHull:
+        return ConvexHull(self.surface.points[:, :2], qhull_options="QJ")
 
     @cached_property
-    def _tree(self) -> cKDTree:
+    def tree(self) -> cKDTree:
         return cKDTree(self.surface.points)
 
     @cached_property
     def _images(self) -> "tuple[_Raster, Array]":
         steep = self.surface.steep
         raster = _Raster.around(self.surface.points[steep])
-        images = gaussian_filter(
-            raster.draw(self.surface.points[steep], self.surface.normals[steep]), (0, _SMOOTHED, _SMOOTHED)
-        )
+        images = raster.draw(self.surface.points[steep], self.surface.normals[steep])
+        images = gaussian_filter(images, (0, _SMOOTHED, _SMOOTHED))
         images[0] -= gaussian_filter(images[0], _BACKGROUND)
         images[0] *= _PRESENCE
         return raster, images
@@ -248,9 +231,8 @@ class SurfaceIndex:
             pixels, best = _peaks(scores)
             # Negative shifts of a periodic image are at its end.
             pixels = np.where(pixels > np.array(raster.shape) + half, pixels - shape, pixels) + half
-            found.append(
-                np.column_stack([best, np.full(len(best), yaw), raster.corner + (pixels + 0.5) * pixel_m])
-            )
+            at = raster.corner + (pixels + 0.5) * pixel_m
+            found.append(np.column_stack([best, np.full(len(best), yaw), at]))
         all_found = np.concatenate(found)
         all_found = all_found[np.argsort(-all_found[:, 0], kind="stable")]
         chosen: list[Floats] = []
@@ -286,10 +268,7 @@ class _Raster:
         """Draw points (N, 3) with normals (N, 3): presence and mean horizontal normals, (3, rows, columns)."""
         # Presence instead of numbers, which depend on the radar and on how often it came by.
         pixels = np.floor((points[:, :2] - self.corner) / self.pixel_m).astype(np.int64)
-        flat, size = (
-            np.ravel_multi_index(tuple(pixels.T), self.shape, mode="clip"),
-            self.shape[0] * self.shape[1],
-        )
+        flat, size = np.ravel_multi_index(tuple(pixels.T), self.shape, mode="clip"), math.prod(self.shape)
         counts = np.bincount(flat, minlength=size)
         sums = [counts > 0, *(np.bincount(flat, n, size) / np.maximum(counts, 1) for n in normals[:, :2].T)]
         return np.stack(sums).astype(np.float32).reshape(3, *self.shape)
@@ -298,9 +277,7 @@ class _Raster:
 def _peaks(scores: Array) -> tuple[Array, Array]:
     """Return the pixels (K, 2) of the best scores of as many blocks of 4 × 4, and these scores (K,)."""
     rows, columns = (4 * (n // 4) for n in scores.shape)
-    blocks = (
-        scores[:rows, :columns].reshape(rows // 4, 4, columns // 4, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
-    )
+    blocks = scores[:rows, :columns].reshape(rows // 4, 4, columns // 4, 4).swapaxes(1, 2).reshape(-1, 16)
     best = blocks.max(axis=1)
     chosen = np.argpartition(-best, min(_PEAKS, len(best)) - 1)[:_PEAKS]
     inside = blocks[chosen].argmax(axis=1)
@@ -316,10 +293,7 @@ def search_scans(
     Return the transform (4, 4) from the world of the drive to that of the map, and the scans of the part.
     """
     why = Lost("there are no returns")
-    for part in _parts(len(poses)):
-        submap = _submap(index, returns, poses, part, num_threads)
-        if submap is None:
-            continue
+    for part, submap in _submaps(index, returns, poses, num_threads):
         try:
             return search(index, submap, num_threads), part
         except Lost as lost:
@@ -327,24 +301,19 @@ def search_scans(
     raise why
 
 
-def _parts(count: int) -> Iterator[slice]:
-    """Yield the parts of a drive of `count` scans, ever longer ones."""
-    length = SUBMAP_SCANS
-    while True:
-        for first in range(0, max(count - length // 2, 1), length):
-            yield slice(first, min(first + length, count))
-        if length >= count:
-            return
+def _submaps(
+    index: SurfaceIndex, returns: SensorReturns, poses: Floats, num_threads: int, *, begins: bool = False
+) -> Iterator[tuple[slice, OrientedPoints]]:
+    """Yield parts of a drive with returns, ever longer ones, and their surfaces. `begins`: only those from the first scan on."""
+    count, length = len(poses), SUBMAP_SCANS // 2
+    while length < count or length < SUBMAP_SCANS:
         length *= 2
-
-
-def _submap(
-    index: SurfaceIndex, returns: SensorReturns, poses: Floats, part: slice, num_threads: int
-) -> OrientedPoints | None:
-    inside = returns.select((returns.scans >= part.start) & (returns.scans < part.stop))
-    if len(inside) == 0:
-        return None
-    return OrientedPoints.of_returns(inside, poses, index.cell_m / LEAVES_PER_SURFEL, num_threads)
+        for first in range(0, 1 if begins else max(count - length // 2, 1), length):
+            part = slice(first, min(first + length, count))
+            inside = returns.select((returns.scans >= part.start) & (returns.scans < part.stop))
+            if len(inside):
+                leaf_m = index.cell_m / LEAVES_PER_SURFEL
+                yield part, OrientedPoints.of_returns(inside, poses, leaf_m, num_threads)
 
 
 def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Floats:
@@ -359,19 +328,9 @@ def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Flo
         msg = "the scans or the map show no steep surface"
         raise Lost(msg)
     found = _Places.of(index, submap, starts)
-    best = int(np.argmax(found.agreeing))
-    T_map_own, at = found.poses_of_frame, found.names
-    k = found.rival(best)
-    if k is not None:
-        msg = f"two places of the map fit about equally well: {at[best]} and {at[k]}"
-        raise Lost(msg, T_map_own[[best, k]], float(found.agreeing[best]))
-    if found.covered(best) < _COVERED or len(found.elsewhere(best)) == 0:
-        msg = (
-            f"the map has {found.covered(best):.0%} of the surfaces around the best place, {at[best]}, "
-            f"and {_COVERED:.0%} is needed"
-        )
-        raise Lost(msg, T_map_own[[best]], float(found.agreeing[best]))
-    return T_map_own[best]
+    if (why := found.refusal(found.best)) is not None:
+        raise why
+    return found.poses_of_frame[found.best]
 
 
 def search_near(
@@ -383,21 +342,17 @@ def search_near(
     Lost if the drive clearly agrees better elsewhere.
     """
     note = "The returns do not confirm the guess: the scans or the map show no steep surface."
-    for part in _parts(len(poses)):
-        # The guess is that of the first scan, from which poses drift.
-        submap = None if part.start else _submap(index, returns, poses, part, num_threads)
-        if submap is None:
-            continue
+    # The guess is that of the first scan, from which poses drift.
+    for _, submap in _submaps(index, returns, poses, num_threads, begins=True):
         starts = index.candidates(submap, num_threads)
         if len(starts) == 0:
             continue
         found = _Places.of(index, submap, starts, guess)
-        k = int(np.argmax(found.agreeing))
-        if k in found.elsewhere(0) and found.rival(k) is None and found.covered(k) >= _COVERED:
-            msg = (
-                f"the scans agree better with the map at {found.names[k]} than at the guess, {found.names[0]}"
-            )
-            raise Lost(msg, found.poses_of_frame[[k, 0]], float(found.agreeing[k]))
+        k = found.best
+        if k in found.elsewhere(0) and found.refusal(k) is None:
+            at = found.names
+            msg = f"the scans agree better with the map at {at[k]} than at the guess, {at[0]}"
+            raise found.lost(msg, k, 0)
         rival = found.rival(0)
         if rival is None:
             return found.poses_of_frame[0], ""
@@ -452,6 +407,10 @@ class _Places:
         return self.scores.mean(axis=1)
 
     @property
+    def best(self) -> int:
+        return int(np.argmax(self.agreeing))
+
+    @property
     def names(self) -> list[str]:
         return [f"({x:.1f}, {y:.1f})" for x, y in self.poses[:, :2, 3] + self.index.origin[:2]]
 
@@ -462,16 +421,35 @@ class _Places:
         poses[:, :3, 3] += self.index.origin
         return poses
 
+    def lost(self, message: str, *places: int) -> Lost:
+        """Return the error with a message about these places, the best first."""
+        return Lost(message, self.poses_of_frame[[*places]], float(self.agreeing[places[0]]))
+
+    def refusal(self, place: int) -> Lost | None:
+        """Return why the submap cannot be placed at its best place. None if it can."""
+        at, covered = self.names, self.covered(place)
+        if (k := self.rival(place)) is not None:
+            words = f"two places of the map fit about equally well: {at[place]} and {at[k]}"
+            return self.lost(words, place, k)
+        if covered < _COVERED or len(self.elsewhere(place)) == 0:
+            words = f"the map has {covered:.0%} of the surfaces around the best place, {at[place]}, and {_COVERED:.0%} is needed"
+            return self.lost(words, place)
+        return None
+
     def elsewhere(self, place: int) -> Ints:
         """Return the other places, best first."""
         lever_m = float(np.median(np.linalg.norm(self.points, axis=1)))
         others = np.flatnonzero(apart_m(self.poses, self.poses[place], lever_m) > self.capture_m)
         return others[np.argsort(-self.agreeing[others])]
 
+    def points_at(self, place: int) -> Floats:
+        pose = self.poses[place]
+        return self.points @ pose[:3, :3].T + pose[:3, 3]
+
     def covered(self, place: int) -> float:
         """Return the share of the points that have a surface of the map near them."""
-        pose = self.poses[place]
-        return float(self.index.covers(self.points @ pose[:3, :3].T + pose[:3, 3], self.capture_m).mean())
+        distances_m, _ = self.index.tree.query(self.points_at(place), distance_upper_bound=self.capture_m)
+        return float(np.isfinite(distances_m).mean())
 
     def rival(self, place: int) -> int | None:
         """Return another place with which the submap does not clearly agree less."""
@@ -479,10 +457,9 @@ class _Places:
         chance = float(np.median(self.agreeing[others])) if len(others) else 0.0
         for k in others.tolist():
             # A map of a part of the scene says nothing about what lies around it.
-            pose = self.poses[k]
-            known = self.index.outlines(self.points @ pose[:3, :3].T + pose[:3, 3], self.capture_m)
+            known = self.index.outlines(self.points_at(k), self.capture_m)
             compared = self.scores[place, known], self.scores[k, known], chance, self.blocks[known]
-            if known.mean() >= _KNOWN and not _Evidence.of(*compared).decides:
+            if known.mean() >= _KNOWN and not _clearly_better(*compared):
                 return k
         return None
 
@@ -494,32 +471,20 @@ def _shifted(poses: Floats, shift: Floats) -> Floats:
     return poses
 
 
-class _Evidence(NamedTuple):
-    """Evidence for one of two places."""
-
-    significance: float  # Student's t of the difference of agreement
-    needed: float
-    log_odds: float
-
-    @property
-    def decides(self) -> bool:
-        return self.significance > self.needed and self.log_odds > _LOG_ODDS
-
-    @classmethod
-    def of(cls, scores: Floats, others: Floats, chance: float, blocks: Array) -> "_Evidence":
-        """Compare scores (N,), in [0, 1], of points at a place and at another, in `blocks` (N,) with common errors."""
-        blocks = np.unique(blocks, return_inverse=True)[1]
-        counts = np.bincount(blocks)
-        gains = np.bincount(blocks, scores - others) / counts
-        off = counts * (gains - np.average(gains, weights=counts))
-        error = np.sqrt((off**2).sum() * len(off) / max(len(off) - 1, 1)) / counts.sum()
-        # An object agrees at the true place unless it changed (share c), and elsewhere by chance (q). One that agrees only at the
-        # first place has the likelihood (1 - c) (1 - q) if that is the true one, else c q.
-        changed = min(max(1 - float(scores.mean()), 1e-2), 1 - 1e-2)
-        chance = min(max(chance, 1e-2), 1 - 1e-2)
-        ratio = np.log((1 - changed) * (1 - chance) / (changed * chance))
-        significance = np.average(gains, weights=counts) / max(error, 1e-12)
-        return cls(float(significance), student.isf(_BY_CHANCE, len(counts) - 1), float(gains.sum() * ratio))
+def _clearly_better(scores: Floats, others: Floats, chance: float, blocks: Ints) -> bool:
+    """Compare scores (N,), in [0, 1], of points at a place and at another, in `blocks` (N,) with common errors."""
+    blocks = np.unique(blocks, return_inverse=True)[1]
+    counts = np.bincount(blocks)
+    gains = np.bincount(blocks, scores - others) / counts
+    mean = np.average(gains, weights=counts)
+    squares = ((counts * (gains - mean)) ** 2).sum() * len(counts) / max(len(counts) - 1, 1)
+    error = np.sqrt(squares) / counts.sum()
+    # An object agrees at the true place unless it changed (share c), and elsewhere by chance (q). One that agrees only at the
+    # first place has the likelihood (1 - c) (1 - q) if that is the true one, else c q.
+    changed, chance = np.clip([1 - scores.mean(), chance], 1e-2, 1 - 1e-2)
+    log_odds = gains.sum() * np.log((1 - changed) * (1 - chance) / (changed * chance))
+    significant = mean / max(error, 1e-12) > student.isf(_BY_CHANCE, len(counts) - 1)
+    return bool(significant and log_odds > _LOG_ODDS)
 
 
 def _at_heights(planes: PlaneMap, starts: Floats, points: Floats, heights_m: Floats) -> Floats:

@@ -1,7 +1,6 @@
 """Drives without poses: prediction of each step, registration with the previous scans, and passes that learn the motion prior."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -46,11 +45,6 @@ _MOST_RADII = 10.0  # maximum standard deviation of a predicted translation, med
 _MOST_RECKONED_M = 1e4  # and for a segment to begin at the dead-reckoned pose: over a day, that is useless
 
 
-def begin_segment(pose: Floats, segment: int = 0) -> Tracked:
-    """Return the first scan of a segment, at this pose (4, 4)."""
-    return Tracked(pose, np.zeros((6, 6)), np.nan, segment, np.zeros(3))
-
-
 @dataclass
 class Tracker:
     """Local map of planes of the last scans, and the last pose."""
@@ -65,10 +59,8 @@ class Tracker:
     _recent: deque[tuple[Floats, Floats, Floats]] = field(default_factory=deque)
     _scans: int = 0
 
-    def register(self, scan: Floats, predicted: PredictedStep | None) -> Tracked:
-        """Register a scan (N, 3), sensor frame, m, with the map, near the predicted step. None: the first scan."""
-        if predicted is None or not self._scans:
-            return begin_segment(np.eye(4))
+    def register(self, scan: Floats, predicted: PredictedStep) -> Tracked:
+        """Register a scan (N, 3), sensor frame, m, with the map, near the predicted step."""
         scan = thin(scan)
         if len(scan) == 0:
             return self._dead_reckon(predicted)
@@ -85,7 +77,7 @@ class Tracker:
                 return self._dead_reckon(predicted)
         # Tracking is lost: the maps before and after cannot be joined.
         begin = self.last.pose @ predicted.pose() if spread_m <= _MOST_RECKONED_M else self.last.pose
-        return begin_segment(begin, self.last.segment + 1)
+        return Tracked(begin, segment=self.last.segment + 1)
 
     def add(self, scan: Floats, found: Tracked) -> None:
         """Add a registered scan to the map, without the oldest."""
@@ -170,9 +162,6 @@ _PASSES = 3
 # Initial priors, until the drive's own rates replace them. With 1 rad/s, first steps of sparse real scans were wrong by up to 9 degrees.
 TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
-# Minimum share of a step's prior variance that the returns must remove if nothing else measures the translation. Below half,
-# the prior is more informative. Simulated walls: 0.08 and 0.10; all other scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
-LEAST_OBSERVED = 0.5
 # Standard deviation of the lateral acceleration: at high speed, turns are slow. Vehicles on roads: about 1; drones and hands: 2.
 LATERAL_MPS2 = 2.0
 # Maximum standard deviation of a turn rate that may remain unobserved between scans, that of a sensor faster than 20 m/s: the joint
@@ -241,10 +230,9 @@ class Drive:
     def turns_slowly(self) -> bool:
         return self.usual_turn_rad_s < _SLOW_TURN_RAD_S
 
-    def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
-        """Return the measured motions between the scans of `rows`."""
-        times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
-        turns = np.stack([found.turn for found in tracked[rows][1:]])
+    def motions(self, poses: Floats, turns: Floats, rows: slice) -> list[Motion]:
+        """Return the measured motions between the K scans of `rows`, with tracked poses (K, 4, 4) and turns (K - 1, 3)."""
+        times_s = self.times_s[rows]
         duration_s, turn_sigma_rad_s = usual_duration_s(np.diff(times_s)), np.full(3, self.usual_turn_rad_s)
         usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
         measured = np.repeat([self.velocities is not None, self.gyroscope is not None], 3)
@@ -301,7 +289,7 @@ def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rate
     last: Rates = None, None
     for i, scan in enumerate(drive.scans):
         predicted = drive.predict(i, *last) if i else None
-        now = tracker.register(scan, predicted)
+        now = Tracked(np.eye(4)) if predicted is None else tracker.register(scan, predicted)
         tracker.add(scan, now)
         if predicted is not None:
             before, duration_s = tracked[-1], predicted.duration_s
