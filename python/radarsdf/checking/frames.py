@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -81,10 +80,8 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
             yield Finding(f"{unknown}_undecided", "note", evidence)
         return
     guess, gain, significance = best
-    evidence = (
-        f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times closer to each other ({len(pairs)} pairs of "
-        f"scans, {significance:.0f} standard errors)."
-    )
+    sure = f"{len(pairs)} pairs of scans, {significance:.0f} standard errors"
+    evidence = f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times closer to each other ({sure})."
     yield Finding(guess.finding, _severity(gain, guess.finding), evidence)
 
 
@@ -107,10 +104,8 @@ def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     moved = change > max(_MIN_GAIN, _MIN_SIGNIFICANCE * error)
     evidence = f"All {len(recording)} poses have the same position"
     if moved:
-        evidence += (
-            f", but returns of scans far apart in time are {np.exp(change):.2f} times farther apart than those of "
-            f"neighbours ({change / error:.0f} standard errors)"
-        )
+        apart = f"returns of scans far apart in time are {np.exp(change):.2f} times farther apart"
+        evidence += f", but {apart} than those of neighbours ({change / error:.0f} standard errors)"
     yield Finding("poses_stand_still", "error" if moved else "warning", f"{evidence}.")
 
 
@@ -172,16 +167,20 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
     moved = [(scan - T[:3, 3]) @ T[:3, :3] for scan, T in zip(given, recording.poses[rows], strict=True)]
     first, second = np.searchsorted(rows, pairs.T)
     significances = []
-    both = [
-        [(x, x / np.maximum(np.linalg.norm(x, axis=1), 1e-12)[:, None]) for x in of] for of in (given, moved)
-    ]
-    middles: tuple[Any, ...] = (np.median, np.mean)
-    for k, middle in enumerate(middles):
-        before, after = (np.array([middle(scan[k], axis=0) for scan in scans]) for scans in both)
+    for middle in (_centroid, _mean_direction):
+        before, after = (np.array([middle(scan) for scan in scans]) for scans in (given, moved))
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
         significances.append(Gain.of_samples(steadier).significance)
     return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
+
+
+def _centroid(scan: Floats) -> Floats:
+    return np.median(scan, axis=0)
+
+
+def _mean_direction(scan: Floats) -> Floats:
+    return np.mean(scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None], axis=0)
 
 
 _UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}

@@ -67,10 +67,9 @@ def check_noise_and_cost(recording: Scans, config: FitConfig) -> Iterator[Findin
     surfels = Surfels.of(rays, config.leaf_size_m)
     noise = sensor_noise(surfels, rays, config.returns)
     yield from _check_poses(rays, surfels, noise)
-    evidence = (
-        f"The noise of the sensor is about {noise.range_m:.3f} m along the beam, {np.degrees(noise.azimuth_rad):.2f} "
-        f"degrees in azimuth and {np.degrees(noise.elevation_rad):.2f} degrees in elevation."
-    )
+    azimuth, elevation = (f"{np.degrees(of):.2f} degrees" for of in (noise.azimuth_rad, noise.elevation_rad))
+    beam = f"The noise of the sensor is about {noise.range_m:.3f} m along the beam"
+    evidence = f"{beam}, {azimuth} in azimuth and {elevation} in elevation."
     yield Finding("noise", "note", evidence)
     yield Finding("cost", "note", f"A fit has {estimate_rays(rays, config)}.")
 
@@ -189,9 +188,8 @@ def _scale(values: Floats) -> Iterator[Finding]:
         yield Finding("intensity_steps", "note", evidence)
     bytes_ = (values == np.round(values)).all() and levels[0] >= 0 and levels[-1] <= 255
     if few and bytes_ and low > 64 and abs(middle - _RCS_OFFSET) < 40:
-        evidence = (
-            f"Intensities are whole numbers with the median {middle:g}, like dBsm with {_RCS_OFFSET} added."
-        )
+        like = f"like dBsm with {_RCS_OFFSET} added"
+        evidence = f"Intensities are whole numbers with the median {middle:g}, {like}."
         yield Finding("intensity_offset", "note", evidence)
     if len(levels) > 4 and shares[-1] > max(_SOME_CLIPPED, _ABOVE_NEXT * float(shares[-4:-1].mean())):
         evidence = f"{shares[-1]:.1%} of the intensities have the highest value, {levels[-1]:g}."

@@ -141,10 +141,8 @@ def check_jumps(recording: Scans, numbers: Ints, effort: Effort = FULL) -> Itera
     if confirmed:
         worst = max(confirmed, key=lambda k: changes[k])
         step_m, turn_deg = np.linalg.norm(moved[worst, :3]), np.degrees(np.linalg.norm(moved[worst, 3:]))
-        evidence = (
-            f"{len(confirmed)} of {count - 1} steps are jumps, the largest after scan {numbers[worst]}: {step_m:.3g} m and "
-            f"{turn_deg:.3g} degrees; without them, the scans agree better."
-        )
+        largest = f"the largest after scan {numbers[worst]}: {step_m:.3g} m and {turn_deg:.3g} degrees"
+        evidence = f"{len(confirmed)} of {count - 1} steps are jumps, {largest}; without them, the scans agree better."
         yield Finding("pose_jumps", "error" if len(confirmed) > count // 10 else "warning", evidence)
 
 
@@ -280,10 +278,8 @@ def _time_offsets(given: Floats, refined: Floats, begin: int) -> Iterator[tuple[
         if offset % 1:  # means of two steps have smaller errors, whatever the offset
             other = min(other, fit(-offset)[1].mean())
         ratio = len(rows) * (other - errors.mean()) - np.log(len(offsets))
-        evidence = (
-            f"The scans move as the poses do about {abs(offset):g} scans {'later' if offset > 0 else 'earlier'} "
-            f"(log likelihood ratio to drift: {ratio:.0f})."
-        )
+        when = f"about {abs(offset):g} scans {'later' if offset > 0 else 'earlier'}"
+        evidence = f"The scans move as the poses do {when} (log likelihood ratio to drift: {ratio:.0f})."
         yield float(ratio), Finding("clock_offset", "error", evidence)
 
 
@@ -300,10 +296,9 @@ def _mountings(given: Floats, refined: Floats, begin: int) -> Iterator[tuple[flo
         ratio = (drift[first:] - left).sum() - 1.5 * np.log(count - first) - np.log(count) * (first > 0)
         degrees = np.degrees(Rotation.from_matrix(turn).magnitude())
         since = f" from scan {begin + first} on" if first else ""
-        evidence = (
-            f"The scans move as if the sensor were turned by {degrees:.1f} degrees against the frame of the poses{since} (log "
-            f"likelihood ratio to drift: {ratio:.0f})."
-        )
+        turned = f"turned by {degrees:.1f} degrees against the frame of the poses{since}"
+        moves = f"The scans move as if the sensor were {turned}"
+        evidence = f"{moves} (log likelihood ratio to drift: {ratio:.0f})."
         yield float(ratio), Finding("sensor_turned", "warning", evidence)
 
 
@@ -343,8 +338,7 @@ def check_order(recording: Scans, numbers: Ints) -> Iterator[Finding]:
     if not d:
         return
     first, second = (f"{numbers[rows[i]]} to {numbers[rows[j - 1]]}" for i, j in ((a, b), (c, d)))
-    evidence = (
-        f"If scans {first} and scans {second} change places, returns of neighbouring scans are {np.exp(gain):.2f} times closer to "
-        f"each other at the ends of these blocks ({significance:.0f} standard errors)."
-    )
+    closer = f"{np.exp(gain):.2f} times closer to each other at the ends of these blocks ({significance:.0f} standard errors)"
+    exchange = f"If scans {first} and scans {second} change places"
+    evidence = f"{exchange}, returns of neighbouring scans are {closer}."
     yield Finding("scans_exchanged", "error", evidence)

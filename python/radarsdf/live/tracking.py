@@ -423,7 +423,4 @@ def _now(step: Step, log: ScanLog) -> Step | None:
 
 def _signed(velocities: SensorVelocities, sign: int) -> SensorVelocities:
     """Apply the sign of the Doppler. For an unknown one, 0, the mean is zero, and the speed is its deviation."""
-    mean, covariance = velocities.mean_mps, velocities.covariance
-    if sign == 0:
-        covariance = covariance + mean[:, :, None] * mean[:, None, :]
-    return dataclasses.replace(velocities, mean_mps=sign * mean, covariance=covariance)
+    return dataclasses.replace(velocities.scaled(1.0, float(sign == 0)), mean_mps=sign * velocities.mean_mps)

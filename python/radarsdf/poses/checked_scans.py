@@ -47,10 +47,8 @@ class CheckedScans:
         _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
         range_m = median_range_m(scans)
-        check(
-            range_m <= _MOST_M,
-            f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m",
-        )
+        far = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
+        check(range_m <= _MOST_M, far)
         rows, notes, times_s = np.arange(len(scans)), left_out.notes, _checked_times(times, len(scans))
         begin_s = float(times_s[0])
         times_s, repeated = _spread_times(times_s - begin_s)
@@ -118,11 +116,9 @@ class CheckedScans:
         step_m = 0.0 if self.velocities is None else self.velocities.usual_mps * interval_s
         range_m = median_range_m(self.scans)
         low, high = _INTERVALS_S
-        check(
-            step_m <= _MOST_REACHES * range_m and low <= interval_s <= high,
-            f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler, "
-            f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s",
-        )
+        apart = f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler"
+        msg = f"{apart}, while returns are {range_m:.1f} m away: give times in s, Doppler in m/s"
+        check(step_m <= _MOST_REACHES * range_m and low <= interval_s <= high, msg)
 
 
 def join_radars(rig: Rig | None, radars: Sequence[CheckedScans]) -> CheckedScans:
