@@ -32,7 +32,7 @@
 #include "surface/sparse_lattice.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
-#include "util/parallel_sort.hpp"
+#include "util/sorting.hpp"
 #include "util/thread_pool.hpp"
 
 namespace {

@@ -13,9 +13,8 @@
 #include "util/bits.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
-#include "util/parallel_sort.hpp"
 #include "util/random_bytes.hpp"
-#include "util/stable_order.hpp"
+#include "util/sorting.hpp"
 #include "util/thread_pool.hpp"
 
 TEST_CASE("bit counts and positions equal those of std::bitset") {
