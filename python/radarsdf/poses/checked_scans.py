@@ -18,6 +18,7 @@ from radarsdf.rig import Rig
 from radarsdf.scans import Scans, chosen, filled
 
 _Points: TypeAlias = Iterable[ArrayLike] | Scans
+_Doppler: TypeAlias = Sequence[ArrayLike] | None
 
 _MOST_M = 500.0  # maximum median range, m. Imaging radars reach 300 m
 _INTERVALS_S = 0.002, 20.0  # limits of the median scan interval: 500 Hz, and no overlap of moving scans
@@ -41,7 +42,7 @@ class CheckedScans:
     yaws: Floats | None = None
 
     @classmethod
-    def of(cls, points: _Points, doppler_mps: Sequence[ArrayLike] | None, times: ArrayLike | None) -> Self:
+    def of(cls, points: _Points, doppler_mps: _Doppler, times: ArrayLike | None) -> Self:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
         check(doppler_mps is None or times is not None or isinstance(points, Scans), _NO_TIMES)
         _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
@@ -77,12 +78,7 @@ class CheckedScans:
 
     @classmethod
     def of_radars(
-        cls,
-        points: _Points,
-        doppler_mps: Sequence[ArrayLike] | None,
-        times: ArrayLike | None,
-        *,
-        mounted: bool = True,
+        cls, points: _Points, doppler_mps: _Doppler, times: ArrayLike | None, *, mounted: bool = True
     ) -> tuple[Rig | None, list[Self]]:
         """:meth:`of` for each radar, and the rig if there are several, whose mountings must be known if `mounted`."""
         rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)

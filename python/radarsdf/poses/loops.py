@@ -65,16 +65,11 @@ def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_
 
 
 def close_loop(
-    returns: SensorReturns,
-    poses: Floats,
-    visit: tuple[Ints, Ints],
-    variances: list[float],
-    cell_m: float,
-    num_threads: int = 0,
+    returns: SensorReturns, poses: Floats, visit: tuple[Ints, Ints], planes: PlaneMap, num_threads: int
 ) -> Floats | None:
     """Return the poses (F, 4, 4) with a visit registered with earlier scans, and the path to it bent. None if it is there already.
 
-    `variances` are those of :attr:`SensorNoise.variances`. The joint estimate from the returned poses closes the loop if it is one.
+    `planes`: an empty map, to which the earlier scans are added. The joint estimate from the returned poses closes the loop if it is one.
     """
     later, earlier = visit
     path_m, range_m = _path_m(poses), float(np.median(returns.ranges_m))
@@ -88,11 +83,10 @@ def close_loop(
     if min(len(known), len(seen)) == 0 or between_m <= 0:
         return None
     # Surfels, not returns: the noise of few scans makes wrong planes, which attract them.
-    leaf_m = cell_m / LEAVES_PER_SURFEL
+    leaf_m = planes.cell_size_m / LEAVES_PER_SURFEL
     surfaces = [OrientedPoints.of_returns(part, poses, leaf_m, num_threads).points for part in (known, seen)]
     if min(map(len, surfaces)) == 0:
         return None
-    planes = PlaneMap(cell_m, variances)
     planes.add(surfaces[0])
     scan = thin((surfaces[1] - own[:3, 3]) @ own[:3, :3])
     radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
@@ -100,7 +94,7 @@ def close_loop(
     pose = own
     for _ in range(_PASSES):
         pose = planes.fit(scan, own, prior, pose).pose
-    if apart_m(pose[None], own, radius_m)[0] < cell_m:
+    if apart_m(pose[None], own, radius_m)[0] < planes.cell_size_m:
         return None
     share = np.clip((path_m - begin_m) / between_m, 0, 1)[:, None]
     moved_m, turned = np.split(share * increments(own, pose), 2, axis=1)

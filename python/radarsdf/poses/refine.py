@@ -19,7 +19,7 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import DopplerMotion
 from radarsdf.poses.loops import close_loop, open_loops, visits
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
-from radarsdf.poses.planes import SensorReturns, common_planes, plane_cell_m
+from radarsdf.poses.planes import PlaneMap, SensorReturns, common_planes, plane_cell_m
 from radarsdf.poses.rigid import aligned, increments, moved, steps, turned_by
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut
@@ -127,7 +127,8 @@ def estimate_closed(
     found = PosesEstimate.of(returns, given, *fixed, first_window, progress)
     held = _hold_out(len(returns), 0)
     for visit in visits(returns, found.poses):
-        start = close_loop(returns, found.poses, visit, found.noise.variances, cell_m, num_threads)
+        planes = PlaneMap(cell_m, found.noise.variances)
+        start = close_loop(returns, found.poses, visit, planes, num_threads)
         if start is None:
             continue
         closed = PosesEstimate.of(returns, start, *fixed, len(start))
