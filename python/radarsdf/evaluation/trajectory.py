@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check, check_poses, real_array
-from radarsdf.poses.rigid import aligned, assembled, between, nearest_rotation, placed, steps, turned_by
+from radarsdf.poses.rigid import aligned, between, nearest_rotation, placed, steps, turned_by
 
 Alignment = Literal["positions", "poses", "none"]
 
@@ -66,8 +66,7 @@ def trajectory_metrics(
     at = aligned(found, true) if align == "poses" else found
     if align == "positions":
         from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (found, true))
-        whole = assembled(nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle)))
-        at = np.einsum("ij,fjk->fik", placed(whole, found, true), found)
+        at = placed(nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle)), found, true)
     true_steps = steps(true)
     off = between(true_steps, steps(found))
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])

@@ -43,19 +43,16 @@ def between(first: Floats, second: Floats) -> Floats:
     return assembled(turns, np.einsum("fji,fj->fi", back, second[:, :3, 3] - first[:, :3, 3]))
 
 
-def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
-    """Return the motion (4, 4) with the rotation of `turn` that aligns the mean position of poses (F, 4, 4) with `reference`."""
-    whole = turn.copy()
-    middle = poses[:, :3, 3].mean(axis=0)
-    whole[:3, 3] = reference[:, :3, 3].mean(axis=0) - np.einsum("ij,j->i", whole[:3, :3], middle)
-    return whole
+def placed(R: Floats, poses: Floats, reference: Floats) -> Floats:
+    """Rotate poses (F, 4, 4) by R (3, 3), and align their mean position with that of `reference`."""
+    middle, aim = (each[:, :3, 3].mean(axis=0) for each in (poses, reference))
+    return np.einsum("ij,fjk->fik", assembled(R, aim - np.einsum("ij,j->i", R, middle)), poses)
 
 
 def aligned(poses: Floats, reference: Floats) -> Floats:
     """Rigidly align poses (F, 4, 4) with the mean position and mean rotation of `reference`."""
     turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
-    whole = assembled(Rotation.from_matrix(turns).mean().as_matrix())
-    return np.einsum("ij,fjk->fik", placed(whole, poses, reference), poses)
+    return placed(Rotation.from_matrix(turns).mean().as_matrix(), poses, reference)
 
 
 def turned_by(poses: Floats, others: Floats) -> Floats:
