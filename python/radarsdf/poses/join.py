@@ -16,7 +16,7 @@ from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.odometry import odometry
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.refine import FIRST_SIGMAS, PosesEstimate
+from radarsdf.poses.refine import FIRST_SIGMAS, JointEstimator
 from radarsdf.poses.rigid import aligned
 from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
 from radarsdf.scans import Scans
@@ -133,7 +133,8 @@ def _refine(
     motion = Motion.of(before, *sigmas)
     motion.shares[begins[1:-1] - 1] = np.inf  # from one session to the next
     cell_m = plane_cell_m([scan for one in sessions for scan in one.scans], config.leaf_size_m)
-    found = PosesEstimate.of(returns, before, [motion], cell_m, config.returns, num_threads, len(before))
+    estimator = JointEstimator(returns, [motion], cell_m, config.returns, num_threads)
+    found = estimator.estimate(before, len(before))
     # The first session keeps its frame.
     first = found.poses[: begins[1]]
     whole = aligned(first, poses[0])[0] @ np.linalg.inv(first[0])

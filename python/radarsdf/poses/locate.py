@@ -14,7 +14,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.map import Map
 from radarsdf.poses.odometry import track_scans
 from radarsdf.poses.planes import PlaneMap, SensorReturns, Tracked, least_certain, plane_cell_m, thin
-from radarsdf.poses.refine import WEAK, PosesEstimate
+from radarsdf.poses.refine import WEAK, JointEstimator
 from radarsdf.poses.rigid import covariance_in, increments, skew, transform
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near, search_scans
 from radarsdf.poses.tracking import Drive
@@ -207,8 +207,8 @@ class _Localiser:
             motions = self.drive.motions(poses, turns, slice(rows[0], rows[-1] + 1))
             returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
             cell_m = plane_cell_m(scans, self.config.leaf_size_m)
-            options = motions, cell_m, limits, self.num_threads, len(rows), False, anchor
-            found = PosesEstimate.of(returns, poses, *options)
+            estimator = JointEstimator(returns, motions, cell_m, limits, self.num_threads)
+            found = estimator.estimate(poses, len(rows), anchor=anchor)
             poses, covariance = found.poses, found.covariance
         if undecided:
             covariance = covariance + _as_guessed(poses)

@@ -18,7 +18,7 @@ from radarsdf.poses.doppler import NOT_USED, BodyVelocities
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import LEAST_OBSERVED, SensorReturns, Tracked, plane_cell_m
-from radarsdf.poses.refine import RefinedPoses, estimate_closed
+from radarsdf.poses.refine import JointEstimator, RefinedPoses
 from radarsdf.poses.rigid import lengths_of_steps_m, steps
 from radarsdf.poses.tracking import LATERAL_MPS2, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
@@ -218,7 +218,8 @@ def _estimate_jointly(
             continue
         motions = drive.motions(poses[rows], turns[rows][1:], rows)
         # Tracked poses are close to the truth: no short windows are needed.
-        found = estimate_closed(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
+        estimator = JointEstimator(returns, motions, cell_m, limits, num_threads)
+        found = estimator.estimate_closed(poses[rows], len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance
         notes += open_loops(returns, found.poses, found.noise, rows.start)
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance, notes

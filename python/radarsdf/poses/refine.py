@@ -59,34 +59,41 @@ class PosesEstimate:
     noise: SensorNoise
     rounds: int
 
-    @classmethod
-    def of(
-        cls,
-        returns: SensorReturns,
+
+@dataclass(frozen=True)
+class JointEstimator:
+    """Estimates the poses of all scans jointly, from common planes and measured motions."""
+
+    returns: SensorReturns
+    motions: Sequence[Motion]
+    cell_m: float
+    config: ReturnsConfig
+    num_threads: int
+
+    def estimate(
+        self,
         given: Floats,
-        motions: Sequence[Motion],
-        cell_m: float,
-        config: ReturnsConfig,
-        num_threads: int,
         first_window: int = _FIRST_WINDOW,
         progress: bool | None = False,
         anchor: Anchor | None = None,
-    ) -> "PosesEstimate":
-        """Estimate from `given` (F, 4, 4) and measured motions by the Gauss-Newton method, with new planes in each round.
+    ) -> PosesEstimate:
+        """Estimate from `given` (F, 4, 4) by the Gauss-Newton method, with new planes in each round.
 
         Without an anchor, the mean pose is that of `given`, and the covariance relative to the middle scan.
         """
-        poses, count, noise, motions = given, len(given), None, list(motions)
+        poses, count, noise, motions = given, len(given), None, list(self.motions)
         plan, finest, spread = _plan(count, first_window), 1, np.zeros(6)
         bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
         for rounds, (window, planned) in enumerate(bar, 1):
             cells = max(planned, finest)
             # The noise is estimated every other round: it changes slowly.
             even = rounds % 2 == 0
-            grid = window, cells * cell_m, noise if even else None
-            planes, noise = common_planes(returns, poses, *grid, config, num_threads, shifted=even)
+            grid = window, cells * self.cell_m, noise if even else None
+            planes, noise = common_planes(
+                self.returns, poses, *grid, self.config, self.num_threads, shifted=even
+            )
             steps, inverse, inverse_below, decrement = planes.solve(
-                *_prior(motions, poses, anchor), _TOLERANCE, _MOST_ITERATIONS, True, num_threads
+                *_prior(motions, poses, anchor), _TOLERANCE, _MOST_ITERATIONS, True, self.num_threads
             )
             coarser, spread = spread, np.log(step_variances(poses, inverse, inverse_below)).mean(axis=0)
             if rounds == len(plan) - _MOST_ROUNDS + 1 and (spread - coarser > _COARSER).any():
@@ -102,40 +109,32 @@ class PosesEstimate:
         diagonal, below, gradient = _prior(evidence, poses, anchor)
         if anchor is None:
             diagonal[count // 2] += _FIXED * np.eye(6)
-        covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
+        covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, self.num_threads)[1]
 
         def solve(more: Floats | float) -> Floats:
             """Solve for increments (F, 6) with `more` added to the gradient."""
             right = gradient + more
-            return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
+            return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, self.num_threads)[0]
 
-        return cls(poses, covariance + _by_biases(evidence, poses, solve), motions, noise, rounds)
+        covariance = covariance + _by_biases(evidence, poses, solve)
+        return PosesEstimate(poses, covariance, motions, noise, rounds)
 
-
-def estimate_closed(
-    returns: SensorReturns,
-    given: Floats,
-    motions: Sequence[Motion],
-    cell_m: float,
-    config: ReturnsConfig,
-    num_threads: int,
-    first_window: int = _FIRST_WINDOW,
-    progress: bool | None = False,
-) -> PosesEstimate:
-    """Estimate poses as :meth:`PosesEstimate.of`, and close the loops that are beyond the reach of its planes."""
-    fixed = motions, cell_m, config, num_threads
-    found = PosesEstimate.of(returns, given, *fixed, first_window, progress)
-    held = _hold_out(len(returns), 0)
-    for visit in visits(returns, found.poses):
-        planes = PlaneMap(cell_m, found.noise.variances)
-        start = close_loop(returns, found.poses, visit, planes, num_threads)
-        if start is None:
-            continue
-        closed = PosesEstimate.of(returns, start, *fixed, len(start))
-        parts = returns.select(held), returns.select(~held)
-        if Verdict.of(*parts, found.poses, closed.poses, closed.noise).closed:
-            found = replace(closed, poses=aligned(closed.poses, given))
-    return found
+    def estimate_closed(
+        self, given: Floats, first_window: int = _FIRST_WINDOW, progress: bool | None = False
+    ) -> PosesEstimate:
+        """:meth:`estimate`, and close the loops that are beyond the reach of its planes."""
+        found = self.estimate(given, first_window, progress)
+        for visit in visits(self.returns, found.poses):
+            planes = PlaneMap(self.cell_m, found.noise.variances)
+            start = close_loop(self.returns, found.poses, visit, planes, self.num_threads)
+            if start is None:
+                continue
+            closed = self.estimate(start, len(start))
+            held = _hold_out(len(self.returns), 0)
+            parts = self.returns.select(held), self.returns.select(~held)
+            if Verdict.of(*parts, found.poses, closed.poses, closed.noise).closed:
+                found = replace(closed, poses=aligned(closed.poses, given))
+        return found
 
 
 def _hold_out(count: int, seed: int) -> Bools:
@@ -271,7 +270,8 @@ def refine_poses(
     with ThreadPool(config.num_threads) as pool:
         held = _hold_out(len(returns), config.seed)
         used = returns.select(~held)
-        found = estimate_closed(used, given, motions, cell_m, limits, pool.num_threads, progress=progress)
+        estimator = JointEstimator(used, motions, cell_m, limits, pool.num_threads)
+        found = estimator.estimate_closed(given, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
         notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
