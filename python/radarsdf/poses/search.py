@@ -427,10 +427,11 @@ class _Places:
 
     def refusal(self, place: int) -> Lost | None:
         """Return why the submap cannot be placed at its best place. None if it can."""
-        at, covered = self.names, self.covered(place)
+        at = self.names
         if (k := self.rival(place)) is not None:
             words = f"two places of the map fit about equally well: {at[place]} and {at[k]}"
             return self.lost(words, place, k)
+        covered = self.covered(place)
         if covered < _COVERED or len(self.elsewhere(place)) == 0:
             words = f"the map has {covered:.0%} of the surfaces around the best place, {at[place]}, and {_COVERED:.0%} is needed"
             return self.lost(words, place)
