@@ -96,7 +96,7 @@ def test_planes_of_few_returns_are_coarse():
 
 @pytest.mark.parametrize(("kind", "seed"), [("car_park", 5), ("hall", 4)])
 def test_loops_close_only_where_returns_agree(kind, seed):
-    """The car park was open by 1.95 m. The last scans in the hall also match walls 6.7 m beside their own, where they are not."""
+    """The car park was open by 1.95 m. The last scans in the hall also match walls 6.7 m away from their own."""
     lap = KINDS[kind](seed=seed)
     found = radarsdf.odometry(lap.points, times_s=measured_motion(lap, seed=seed).times_s)
     off = lap.poses[0] @ np.linalg.inv(found.poses[0]) @ found.poses[-1] - lap.poses[-1]
