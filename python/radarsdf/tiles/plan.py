@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 from safetensors import SafetensorError
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
@@ -37,7 +37,6 @@ Tile = tuple[int, int]
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Number = Annotated[int, Field(ge=-(2**53), le=2**53)]  # index of a tile or a cell
 _Length = Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
-_FromList = Field(strict=False)  # JSON has lists, not tuples
 _MAX_REASON_BYTES = 10_000
 
 
@@ -110,10 +109,10 @@ def neighbours(tile: Tile) -> list[Tile]:
 class TilePlan:
     """Properties of a tile known before its fit."""
 
-    tile: Annotated[tuple[_Number, _Number], _FromList]
+    tile: tuple[_Number, _Number]
     returns: _Count  # number of returns in the tile itself
     rays: Annotated[_Count, Field(ge=1)]  # crossing it or its halo
-    origin_cells: Annotated[tuple[_Number, _Number, _Number], _FromList]  # origin of its map, in the lattice
+    origin_cells: tuple[_Number, _Number, _Number]  # origin of its map, in the lattice
     memory_bytes: _Count = 0  # estimates for its fit
     seconds: Annotated[float, Field(ge=0)] = 0.0
 
@@ -128,7 +127,7 @@ class RadarPlan:
 
     label: int | str | None  # None: it is the only one
     sensor: Sensor  # with its noise, and its unit
-    intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, its own units
+    intensity_range: tuple[float, float] | None  # without outliers, its own units
 
 
 @settings
@@ -201,9 +200,7 @@ class Plan:
         return f"{self.digest} {tile.name}"
 
     def _to_json(self) -> bytes:
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        own |= {"config": self.config.to_dict(), "sensor": self.sensor.to_dict()}
-        own["tiles"] = [dataclasses.asdict(planned) for planned in self.tiles]
+        own = dataclasses.asdict(self) | {"sensor": self.sensor.to_dict()}
         own["radars"] = [vars(radar) | {"sensor": radar.sensor.to_dict()} for radar in self.radars]
         return json.dumps(FORMAT | own, indent=1).encode()
 
@@ -226,16 +223,7 @@ class Plan:
             described = by_name(json.loads(content), "the plan")
             check({name: described.pop(name, None) for name in FORMAT} == FORMAT, f"it is not of {FORMAT}")
             described.pop("crc32")
-            plan = cls(
-                config=FitConfig.from_dict(described.pop("config")),
-                sensor=Sensor.from_dict(described.pop("sensor")),
-                tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
-                radars=tuple(
-                    RadarPlan(**radar | {"sensor": Sensor.from_dict(radar["sensor"])})
-                    for radar in described.pop("radars")
-                ),
-                **described,
-            )
+            plan = TypeAdapter(cls).validate_json(json.dumps(described))  # as JSON, whose lists become tuples
             check(plan._file_bytes() == content, "its checksum is wrong")
             return plan
 
