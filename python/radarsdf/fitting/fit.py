@@ -30,7 +30,6 @@ from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Radars, Sensor
 from radarsdf.returns.sums import ScanSums
 from radarsdf.returns.view_statistics import FreeSpace, ViewStatistics
-from radarsdf.rig import Label
 from radarsdf.scans import Scans, filled
 from radarsdf.threads import ThreadPool, resolve_num_threads
 
@@ -146,10 +145,9 @@ class FitInput:
     why_none_moving: str | None = None  # why Doppler was not used, in words
     inside: Bools | None = None
     """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
-    clutter_ratio: float | None = None  # share of the returns not on a thin surface
-    returns_per_cell: float | None = None  # mean number of returns in the cells of surfels
-    sensor: Sensor | None = None
-    sensors: dict[Label, Sensor] = dataclasses.field(default_factory=dict)  # radars of a rig; with `sensor`
+    whole: dict[str, Any] | None = (
+        None  # `MapContents` of the whole map that are not estimated from these rays
+    )
     box_cells: Ints | None = None
     """(2, 3) box [lower, upper) of free-space crossings to store, leaf cells from the origin. None: no limit."""
     sums: ScanSums | None = None  # sums over the scans of the rays, if updated incrementally
@@ -264,12 +262,15 @@ class _Fit:
     ) -> MapContents:
         config, leaf_m, num_threads = self.config, self.config.leaf_size_m, self.pool.num_threads
         rays, scale, surfels = given.rays, given.scale, surface.surfels
-        sensor, sensors = given.sensor, given.sensors
-        clutter_ratio, returns_per_cell = given.clutter_ratio, given.returns_per_cell
-        if sensor is None:
+        whole = given.whole
+        if whole is None:
             assert given.poses is not None
-            sensor = Sensor.of_rays(rays, given.poses, surface.noise.mean)
-            sensors = {} if given.radars is None else given.radars.sensors(rays, given.poses)
+            whole = {
+                "clutter_ratio": surfels.clutter_ratio(),
+                "returns_per_cell": surfels.returns_per_cell(),
+                "sensor": Sensor.of_rays(rays, given.poses, surface.noise.mean),
+                "sensors": {} if given.radars is None else given.radars.sensors(rays, given.poses),
+            }
         noise, true, box_cells = surface.noise, surface.true, given.box_cells
 
         def free_space() -> FreeSpace:
@@ -297,10 +298,7 @@ class _Fit:
             ),
             free_space=Deferred(free_space) if deferred else FreeSpace.none,
             view_statistics=Deferred(view_statistics) if deferred else ViewStatistics.none,
-            clutter_ratio=surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
-            returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
-            sensor=sensor,
-            sensors=sensors,
+            **whole,
         )
 
 

@@ -171,17 +171,10 @@ def fit_tile(folder: str, name: str) -> None:
         rays = rays if radars is None else radars.in_one_unit(rays)
         limits = plan.intensity_range
         scale = None if limits is None else IntensityScale.between(limits)
-        return FitInput(
-            rays,
-            scale,
-            inside=inside,
-            clutter_ratio=plan.clutter_ratio,
-            returns_per_cell=plan.returns_per_cell,
-            sensor=plan.sensor,
-            sensors=plan.sensors,
-            box_cells=plan.box_cells(tile.tile),
-            radars=radars,
-        )
+        names = ("clutter_ratio", "returns_per_cell", "sensor", "sensors")
+        whole = {name: getattr(plan, name) for name in names}
+        box_cells = plan.box_cells(tile.tile)
+        return FitInput(rays, scale, inside=inside, whole=whole, box_cells=box_cells, radars=radars)
 
     radar_map = fit_rays(read, plan.config, progress=False)
     radar_map.report["plan"] = plan.digest_of(tile)
