@@ -145,9 +145,7 @@ class FitInput:
     why_none_moving: str | None = None  # why Doppler was not used, in words
     inside: Bools | None = None
     """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
-    whole: dict[str, Any] | None = (
-        None  # `MapContents` of the whole map that are not estimated from these rays
-    )
+    whole: dict[str, Any] | None = None  # contents common to the tiles of a map
     box_cells: Ints | None = None
     """(2, 3) box [lower, upper) of free-space crossings to store, leaf cells from the origin. None: no limit."""
     sums: ScanSums | None = None  # sums over the scans of the rays, if updated incrementally

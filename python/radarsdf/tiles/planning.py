@@ -21,14 +21,13 @@ from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import StaticReturns
-from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
+from radarsdf.returns.noise import RigNoise, SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import SAME_UNIT, Sensor, Unit, in_map_unit, intensity_units
 from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label
 from radarsdf.scans import Scan, scans_in_memory
-from radarsdf.threads import ThreadPool
 from radarsdf.tiles.plan import Plan, RadarPlan, Tile, TileGrid, TilePlan, folder_of
 
 _LOG = logging.getLogger("radarsdf.tiles")
@@ -225,8 +224,7 @@ class _Planner:
 
     def _completed(self, plan: Plan) -> Plan:
         """Complete the plan with the noise, units and clutter ratio of the largest tiles, and the cost of each."""
-        noises: list[SensorNoise] = []
-        of_radars: list[tuple[SensorNoise, ...]] = []
+        num_threads, noises = plan.config.num_threads, list[SensorNoise]()
         units: list[tuple[Unit | None, ...]] = []
         tiles, clutter, returns, cells, in_cells = [], 0.0, 0, 0, 0.0
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns):
@@ -236,18 +234,10 @@ class _Planner:
             tiles.append(dataclasses.replace(tile, memory_bytes=cost.peak_memory_bytes, seconds=seconds))
             if len(noises) == _SAMPLED_TILES:
                 continue
-            with ThreadPool(plan.config.num_threads) as workers:
-                surfels = Surfels.of(rays, plan.config.leaf_size_m, workers.num_threads)
-                of_rays = surfels, rays, plan.config.returns, workers.num_threads
-                if plan.sensors:
-                    rig = rig_noise(*of_rays)
-                    units.append(intensity_units(surfels, rays, workers.num_threads))
-                    of_radars.append(rig.of_sensors)
-                    noises.append(rig.mean)
-                else:
-                    units.append((SAME_UNIT,))
-                    noises.append(sensor_noise(*of_rays))
-                    of_radars.append((noises[-1],))
+            surfels = Surfels.of(rays, plan.config.leaf_size_m, num_threads)
+            noise_of = rig_noise if plan.sensors else sensor_noise
+            noises.append(noise_of(surfels, rays, plan.config.returns, num_threads))
+            units.append(intensity_units(surfels, rays, num_threads) if plan.sensors else (SAME_UNIT,))
             clutter += surfels.clutter_ratio() * len(rays)
             returns += len(rays)
             # Of the cells beyond, the tile has only the returns whose rays cross it.
@@ -255,15 +245,14 @@ class _Planner:
             held = held[held >= 0]
             in_cells += float(surfels.counts[held].sum())
             cells += len(held)
-        noise = SensorNoise.median(noises)
-        radars, of_radar = [], map(SensorNoise.median, zip(*of_radars, strict=True))
-        same_unit = _median_units(units)
-        for radar, own, unit in zip(plan.radars, of_radar, same_unit, strict=True):
+        noise = SensorNoise.median([of_tile.mean for of_tile in noises])
+        of_rigs = (rig.of_sensors for rig in noises if isinstance(rig, RigNoise))
+        own_noise = [*map(SensorNoise.median, zip(*of_rigs, strict=True))] or [noise]
+        radars, same_unit = [], _median_units(units)
+        for radar, own, unit in zip(plan.radars, own_noise, same_unit, strict=True):
             model = dataclasses.replace(radar.sensor, noise=own, unit=unit)
             radars.append(dataclasses.replace(radar, sensor=model))
-        sensor = plan.sensor
-        if plan.sensors:
-            sensor = self._sensor(zip(self._radars.values(), same_unit, strict=True))
+        sensor = self._sensor(zip(self._radars.values(), same_unit, strict=True))
         return dataclasses.replace(
             plan,
             config=plan.config.override(returns=noise.settings),
