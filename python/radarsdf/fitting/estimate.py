@@ -237,7 +237,7 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
         memory += returns * _PER_RETURN_OF_INTENSITY
     return Estimate(
         peak_memory_bytes=int(max(memory, len(rays) * _PER_RETURN_CLEANED)),
-        seconds=seconds_of(config, schedule, len(rays), cells, rows, with_network),
+        seconds=seconds_of(config, schedule, len(rays), cells, rows),
         returns=returns,
         leaf_cells=cells,
         vertices=rows,
@@ -245,15 +245,13 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
     )
 
 
-def seconds_of(
-    config: FitConfig, schedule: Schedule, returns: int, cells: int, rows: int, with_network: bool
-) -> float:
+def seconds_of(config: FitConfig, schedule: Schedule, returns: int, cells: int, rows: int) -> float:
     """Estimate the wall-clock time of a fit, s, from numbers of returns, leaf cells and feature rows."""
     seconds = _S_PER_RETURN * returns + _S_PER_CELL * cells
     if not config.train:
         return seconds
-    iterations = schedule.sdf_iterations
-    later = max(0, schedule.intensity_iterations - schedule.joint_iterations) if with_network else 0
+    iterations, with_network = schedule.sdf_iterations, schedule.intensity_iterations > 0
+    later = max(0, schedule.intensity_iterations - schedule.joint_iterations)
     # A forward and a backward pass cost as much as three forward ones, and nine if the loss has normals.
     passes = 9 if config.networks.normals and with_network else 3
     of_field = passes * (iterations * schedule.batch_size + later * schedule.intensity_batch_size / 3)
@@ -279,7 +277,7 @@ def skipped_parts(
         changed = config.override(**changes)
         sizes = {"surface_returns": returns, "returns": returns, "vertices": rows}
         scheduled = Schedule.of(changed, with_intensity=network, **sizes)
-        return seconds_of(changed, scheduled, returns, cells, rows, network)
+        return seconds_of(changed, scheduled, returns, cells, rows)
 
     network = with_intensity and config.trains_intensity
     now_s, surface_s = seconds(network), seconds(False, train=True)

@@ -1,6 +1,5 @@
 """Optimisers: Adam (Kingma and Ba, ICLR 2015) by PyTorch, sparse Adam for touched feature rows, SOAP for networks."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -20,39 +19,25 @@ _EPSILON = 1e-15  # 3QFP
 _STATE_DIM, _LAST_STEP = 8, 5
 
 
-class Optimiser(ABC):
-    """Optimiser of `parameters`."""
-
-    def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
-        self.parameters = list(parameters)
-        self.learning_rate = learning_rate
-
-    @abstractmethod
-    def state(self) -> dict[str, Tensor]:
-        """Return all that the next steps depend on, except the parameters, without copying."""
-
-    @abstractmethod
-    def step(self, gradients: Sequence[Tensor], number: int, share: float, pool: ThreadPool | None) -> None:
-        """Take step `number`, from 1 on, by a `share` of the learning rate, on the threads of `pool` if it is idle."""
-
-
-class Adam(Optimiser):
+class Adam:
     """Adam, bit-identical to ``torch.optim.Adam(fused=True)``.
 
     That class imports PyTorch's compiler and SymPy: 800 modules, which take a second, as long as a small fit.
     """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
-        super().__init__(parameters, learning_rate)
+        self.parameters, self.learning_rate = list(parameters), learning_rate
         self._means = [torch.zeros_like(p) for p in self.parameters]
         self._squares = [torch.zeros_like(p) for p in self.parameters]
 
     def state(self) -> dict[str, Tensor]:
+        """Return all that the next steps depend on, except the parameters, without copying."""
         lists = {"mean": self._means, "square": self._squares}
         return {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
 
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor], number: int, share: float, pool: ThreadPool | None) -> None:  # noqa: ARG002
+        """Take step `number`, from 1 on, by a `share` of the learning rate, on the threads of `pool` if it is idle."""
         steps = [torch.tensor(number, dtype=torch.float32, device="cpu")] * len(self.parameters)
         of_each = self.parameters, list(gradients), self._means, self._squares, list[Tensor](), steps
         rates = {"lr": share * self.learning_rate, "beta1": _BETAS[0], "beta2": _BETAS[1], "eps": _EPSILON}
@@ -60,7 +45,7 @@ class Adam(Optimiser):
         step(*of_each, **rates, weight_decay=0.0, amsgrad=False, maximize=False)
 
 
-class Soap(Optimiser):
+class Soap:
     """SOAP (Vyas et al., ICLR 2025) for weight matrices, and :class:`Adam` for the other parameters of a network.
 
     Adam scales each component of a gradient by itself, although the inputs of a layer are correlated. SOAP does so in a
@@ -68,7 +53,7 @@ class Soap(Optimiser):
     """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
-        super().__init__(parameters, learning_rate)
+        self.parameters, self.learning_rate = list(parameters), learning_rate
         # A layer with one output has a weight vector: there is no basis to rotate.
         self._matrices = [i for i, p in enumerate(self.parameters) if p.ndim == 2 and min(p.shape) > 1]
         self._others = [i for i in range(len(self.parameters)) if i not in self._matrices]
@@ -92,6 +77,9 @@ class Soap(Optimiser):
             learning_rate=share * self.learning_rate,
             pool=None if pool is None else pool.core_threads,
         )
+
+
+Optimiser = Adam | Soap
 
 
 def _at(places: Sequence[int], tensors: Sequence[Tensor]) -> list[Tensor]:
