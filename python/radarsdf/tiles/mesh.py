@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -148,26 +148,13 @@ def export_mesh(
 ) -> tuple[int, int]:
     """See :meth:`TiledMap.export`. Unwritable paths are detected before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
-        content_folder(Path(path))
-        parts = parts_of(city, voxel_size, progress, **limits)
-        return write_tileset(city, Path(path), _separate(city, *parts))
+        return _write_tileset(city, Path(path), voxel_size, progress, **limits)
     checked_suffix(path, MESH_SUFFIXES, "meshes")
     check_outputs([path])
     mesh = mesh_of(city, voxel_size, progress, **limits)
     check(len(mesh.faces) != 0, f"{city.folder} has no surface here: nothing written")
     write_mesh(path, mesh)
     return len(mesh.vertices), len(mesh.faces)
-
-
-def _separate(
-    city: TileBlend, paths: Sequence[Path], limits: Limits, tally: Tally
-) -> Iterator[tuple[Floats, Ints32]]:
-    """Yield vertices (V, 3), world, m, and faces (F, 3) tile by tile. Components that reach a border are kept."""
-    for path in paths:
-        vertices, faces, confidence, uncertainty_m, *_ = _read(path).values()
-        part = Surface(vertices, faces, confidence, uncertainty_m, tally, len(faces))
-        used, faces = renumbered(len(vertices), faces[part.kept(limits, _on_borders(city, vertices))])
-        yield vertices[used], faces
 
 
 def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
@@ -197,26 +184,27 @@ _ERROR_OF_EDGE = 1 / 16
 _GREY = MATT["pbrMetallicRoughness"] | {"baseColorFactor": [0.784, 0.784, 0.784, 1.0]}
 
 
-def content_folder(path: Path) -> Path:
-    """Folder of the GLB files of ``NAME.json``. Raises an OSError if one of the two cannot be written."""
-    check_outputs([path])
+def _write_tileset(
+    city: TileBlend, path: Path, voxel_size: float, progress: bool | None, **wanted: Any
+) -> tuple[int, int]:
+    """Write ``NAME.json`` and in a folder ``NAME`` a GLB file per tile with triangles.
+
+    GLB files hold float32 relative to the origin of the tile, which is float64 in the JSON: precision does not depend on the
+    distance from the world's origin. Components that reach a border are kept.
+    """
     folder = path.with_suffix("")
+    check_outputs([path])
     folder.mkdir(exist_ok=True)
     check_outputs([folder / "0_0.glb"])
-    return folder
-
-
-def write_tileset(city: TileBlend, path: Path, meshes: Iterable[tuple[Floats, Ints32]]) -> tuple[int, int]:
-    """Write ``NAME.json`` and a GLB file per tile with triangles. Returns the numbers of vertices and triangles.
-
-    `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. GLB files hold float32 relative to the origin of the
-    tile, which is float64 in the JSON: precision does not depend on the distance from the world's origin.
-    """
-    folder = content_folder(path)
+    paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     children, corners, count = [], [], np.zeros(2, np.int64)
-    for planned, (vertices, faces) in zip(city.tiles, meshes, strict=True):
+    for planned, of_tile in zip(city.tiles, paths, strict=True):
+        vertices, faces, confidence, uncertainty_m, *_ = _read(of_tile).values()
+        part = Surface(vertices, faces, confidence, uncertainty_m, tally, len(faces))
+        used, faces = renumbered(len(vertices), faces[part.kept(limits, _on_borders(city, vertices))])
         if len(faces) == 0:
             continue
+        vertices = vertices[used]
         name, origin = f"{planned.name}.glb", city.config.lattice.position(planned.origin_cells)
         local = vertices - origin
         normals = {"NORMAL": trimesh.Trimesh(local, faces, process=False).vertex_normals}
