@@ -96,7 +96,8 @@ class TileBlend(Map):
         grid, places = self.plan.grid, world[np.isfinite(world).all(axis=1), :2]
         if len(places) == 0:
             return
-        first, last = self._reaches
+        reach_m = grid.halo_m / 2
+        first, last = self.corners_m - reach_m, self.corners_m + (grid.tile_m + reach_m)
         near = ((first <= places.max(axis=0)) & (last >= places.min(axis=0))).all(axis=1)
         for i in np.flatnonzero(near).tolist():
             tile = self.tiles[i].tile
@@ -104,11 +105,9 @@ class TileBlend(Map):
                 yield tile, rows
 
     @cached_property
-    def _reaches(self) -> Floats:
-        """(2, T, 2) lower and upper corner of the area in which each tile has a weight, world, m."""
-        grid = self.plan.grid
-        lower = grid.corner_m + grid.tile_m * np.array([tile.tile for tile in self.tiles])
-        return np.stack([lower - grid.halo_m / 2, lower + (grid.tile_m + grid.halo_m / 2)])
+    def corners_m(self) -> Floats:
+        """(T, 2) lower corners of the tiles, world."""
+        return np.array([self.plan.grid.lower_corner(tile.tile) for tile in self.tiles])
 
     def _known_shares(self, world: Floats, seen: Bools) -> Iterator[Share]:
         """Yield the shares of tiles in whose leaf cells, or on their border, positions (N, 3), world, m, are. Set `seen` (N,)."""

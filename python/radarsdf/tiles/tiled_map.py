@@ -92,8 +92,7 @@ class TiledMap(TileBlend):
         from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
 
         tiles = [tile.tile for tile in self.tiles]
-        lower = np.array([self.plan.grid.lower_corner(tile) for tile in tiles])
-        away = np.clip(position[:2], lower, lower + self.plan.tile_m) - position[:2]
+        away = np.clip(position[:2], self.corners_m, self.corners_m + self.plan.tile_m) - position[:2]
         near = np.flatnonzero(np.linalg.norm(away, axis=1) <= range_m)
         tiles = [tiles[i] for i in near] or tiles[:1]  # far from all tiles, any tile shows nothing
         if self._viewed is None or self._viewed[0] != tiles:
