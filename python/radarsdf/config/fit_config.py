@@ -218,10 +218,8 @@ class FitConfig:
 
 def settings_of_results(config: FitConfig) -> dict[str, Any]:
     """Return :meth:`FitConfig.to_dict` without the settings that affect no result: two fits that agree in these are equal."""
-    settings = config.to_dict()
-    for name in ("num_threads", "max_memory_bytes"):
-        del settings[name]
-    return settings
+    without = ("num_threads", "max_memory_bytes")
+    return {name: value for name, value in config.to_dict().items() if name not in without}
 
 
 def flat_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -241,12 +241,10 @@ class Network(nn.Module):
 
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
-            layers.append(nn.Linear(inputs, outputs, device="meta", dtype=torch.float32))
-            if i < len(widths) - 2:
-                layers.append(nn.ReLU())
-        self.layers = nn.Sequential(*layers)
+        layers = list[nn.Module]()
+        for inputs, outputs in itertools.pairwise(widths):
+            layers += [nn.Linear(inputs, outputs, device="meta", dtype=torch.float32), nn.ReLU()]
+        self.layers = nn.Sequential(*layers[:-1])
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:

@@ -235,7 +235,7 @@ class _Fit:
             field = NeuralField(leaf_keys, config, with_intensity=with_network, num_threads=num_threads)
             field.initialise(torch.Generator("cpu").manual_seed(config.seed))
         else:
-            field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
+            field = average_surface(leaf_keys, surface, returns, config, num_threads)
         self._lap("occupied_cells_s")
 
         sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
@@ -244,8 +244,7 @@ class _Fit:
         closes = learnt.intensities is not None and config.closes_intensity
         training = None
         if isinstance(field, NeuralField):
-            scale = given.scale if config.trains_intensity else None
-            training = Training(field, surface.rays, learnt, scale, schedule, config, self.pool)
+            training = Training(field, surface.rays, learnt, given.scale, schedule, config, self.pool)
         self._lap("start_s")
         return contents, (learnt, surface.surfels) if closes else None, training, saved
 

@@ -127,20 +127,16 @@ CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
 
 @torch.no_grad()
 def average_surface(
-    leaf_keys: Keys,
-    means: MeanRays,
-    returns: ReturnsOfCells,
-    surfels: Surfels,
-    config: FitConfig,
-    num_threads: int,
+    leaf_keys: Keys, used: SurfaceReturns, returns: ReturnsOfCells, config: FitConfig, num_threads: int
 ) -> GridField:
-    """Compute the smoothed average of the rays' truncated signed distances (Curless and Levoy, 1996).
+    """Compute the smoothed average of the truncated signed distances of mean rays (Curless and Levoy, 1996).
 
-    `leaf_keys` (C,): of the field, ascending. `means` and `returns` have the same cells, in the same order.
+    `leaf_keys` (C,): of the field, ascending. `returns`: of the cells of the mean rays, in the same order.
     """
+    assert used.means is not None
     field = GridField(leaf_keys, config.leaf_size_m, num_threads)
-    normals = normals_at(means, surfels, num_threads)
-    distances_m = average_at_corners(field.table, means, returns, normals, config, num_threads)
+    normals = normals_at(used.means, used.surfels, num_threads)
+    distances_m = average_at_corners(field.table, used.means, returns, normals, config, num_threads)
     field.distances_m.copy_(torch.from_numpy(distances_m))
     return field
 
