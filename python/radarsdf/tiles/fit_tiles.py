@@ -8,7 +8,6 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, 
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -102,16 +101,13 @@ def plan_tiles(
         folder.mkdir(exist_ok=True)
         ours = {path.name for path in folder.iterdir()} <= _OURS
         check(ours, f"{folder} holds other files: give a new folder")
-        lock = take_lock(folder / _LOCK, "planned")
-        try:
+        with os.fdopen(take_lock(folder / _LOCK, "planned")):
             if not (folder / PLAN).is_file():  # another process may have just written it
                 shutil.rmtree(folder / TILES, ignore_errors=True)  # left by an unfinished plan
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
                 plan = make_plan(given, folder, config, grid)
                 plan.save(folder)
                 return plan
-        finally:
-            os.close(lock)
     return _known_plan(folder, config, grid, given)
 
 
@@ -146,14 +142,15 @@ def run_fits(
     unknown = sorted(wanted - {tile.name for tile in plan.tiles})
     check(not unknown, f"{folder} has no tiles {', '.join(unknown)}")
     todo = [tile for tile in plan.tiles if tile.name in wanted and not is_done(root, plan, tile)]
-    failed = run_tasks(fit_tile, [(str(root), tile.name) for tile in todo], executor, progress=progress)
-    for i, tile in enumerate(todo):
+    failed = run_tasks(str(root), [tile.name for tile in todo], executor, progress)
+    for tile in todo:
         with suppress(OSError):  # a full disk has been reported
-            if i in failed and not is_done(root, plan, tile):
-                write_whole(failure_path(root, tile), failed[i].encode())
+            if tile.name in failed and not is_done(root, plan, tile):
+                write_whole(failure_path(root, tile), failed[tile.name].encode())
             else:
                 failure_path(root, tile).unlink(missing_ok=True)
-    check(len(failed) < len(plan.tiles), f"all {len(failed)} tiles failed, the first: {failed.get(0)}")
+    first = failed.get(plan.tiles[0].name)
+    check(len(failed) < len(plan.tiles), f"all {len(failed)} tiles failed, the first: {first}")
     return TiledMap(root)
 
 
@@ -195,32 +192,28 @@ def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> Til
 
 
 def run_tasks(
-    task: Callable[..., Any],
-    arguments: Sequence[tuple[Any, ...]],
-    executor: Executor | None,
-    *,
-    progress: bool | None = None,
-) -> dict[int, str]:
-    """Call ``task(*arguments[i])`` for each i. Returns errors by i; the other tasks succeeded."""
-    failed: dict[int, str] = {}
-    futures: dict[Future[Any], int] = {}
-    with tqdm(total=len(arguments), desc="fit", unit="tile", disable=hides_bar(progress)) as bar:
+    folder: str, names: Sequence[str], executor: Executor | None, progress: bool | None
+) -> dict[str, str]:
+    """Fit tiles by name, here or on an executor. Returns errors by name; the other tiles are fitted."""
+    failed: dict[str, str] = {}
+    futures: dict[Future[None], str] = {}
+    with tqdm(total=len(names), desc="fit", unit="tile", disable=hides_bar(progress)) as bar:
 
-        def note(i: int, result: Callable[[], Any]) -> None:
+        def note(name: str, result: Callable[..., None], *arguments: str) -> None:
             try:
-                result()
+                result(*arguments)
             except (BrokenExecutor, CancelledError):
-                failed[i] = "a worker was killed: call again, finished tiles are kept"
+                failed[name] = "a worker was killed: call again, finished tiles are kept"
             except Exception as error:  # noqa: BLE001 - of any kind: the other tiles do not depend on this one
-                failed[i] = str(error) or type(error).__name__
+                failed[name] = str(error) or type(error).__name__
             bar.update()
 
         if executor is None:
-            for i, own in enumerate(arguments):
-                note(i, lambda own=own: task(*own))  # type: ignore[misc]
+            for name in names:
+                note(name, fit_tile, folder, name)
             return failed
         try:
-            futures = {executor.submit(task, *own): i for i, own in enumerate(arguments)}
+            futures = {executor.submit(fit_tile, folder, name): name for name in names}
             waiting = set(futures)
             while waiting:
                 done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
