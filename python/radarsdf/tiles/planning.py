@@ -73,11 +73,9 @@ class ScanStream:
 
 def make_plan(scans: ScanStream, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
     """Read all scans once, write the rays of each tile, and return the plan."""
-    planner, number = _Planner(folder, config, grid), 0
+    planner = _Planner(folder, config, grid)
     for chunk in _chunks(scans, config.returns.accumulate_scans):
-        planner.add(chunk, number)
-        number += len(chunk)
-    check(number != 0, "there are no scans")
+        planner.add(chunk)
     return planner.plan(scans.digest)
 
 
@@ -117,7 +115,8 @@ class _Planner:
         self._radars: dict[Label, _Returns] = {}
         self._with_intensities: bool | None = None
 
-    def add(self, scans: list[Scan], first: int) -> None:
+    def add(self, scans: list[Scan]) -> None:
+        first = sum(map(len, self._axes))
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
             alike = self._with_intensities in (None, has)
@@ -172,6 +171,7 @@ class _Planner:
             raise ValueError(msg) from error
 
     def plan(self, input_digest: str) -> Plan:
+        check(self._axes, "there are no scans")
         tiles = []
         for tile, (returns, rays) in sorted(self._counts.items()):
             if returns == 0:
@@ -306,7 +306,6 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
                 values[own] = Plausible(*radar.intensity_range).kept(rows["intensity"][own])
         rays = dataclasses.replace(rays, intensities=values)
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
-    halo = round(plan.halo_m / plan.config.leaf_size_m)
-    lower = np.array(tile.tile) * plan.tile_cells - plan.origin_cells(tile.tile)[:2] - halo
-    inside = (cells >= lower) & (cells < lower + plan.tile_cells + 2 * halo)
+    (lower, upper), halo = plan.box_cells(tile.tile)[:, :2], round(plan.halo_m / plan.config.leaf_size_m)
+    inside = (cells >= lower - halo) & (cells < upper + halo)
     return rays, np.asarray(inside.all(axis=1))
