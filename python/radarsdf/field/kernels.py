@@ -10,7 +10,7 @@ The core gets tensors as NumPy views of the same memory. Results are bit-identic
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -46,45 +46,40 @@ def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.from_numpy(numbers[first : first + math.prod(shape)].reshape(shape))
 
 
-def _places(points: Tensor, located: Tensor, directions: Tensor | None) -> tuple[Any, Any, Any]:
-    return view(points), located.numpy(), None if directions is None else view(directions)
+class _Weights(NamedTuple):
+    """Weights W of the features F at points x (N, 3), or with directions v (N, 3) their derivatives dW/dx · v.
+
+    The core computes y = W F (interpolate), Wᵀ g (scatter) and d(y · g)/dx (coordinate_gradient). The derivatives of these have
+    the same form, so they suffice for second derivatives.
+    """
+
+    table: VertexTable
+    points: Tensor
+    located: Tensor  # of the points, see :func:`locate`
+    directions: Tensor | None = None
+
+    @property
+    def _places(self) -> tuple[Any, Any, Any]:
+        directions = None if self.directions is None else view(self.directions)
+        return view(self.points), self.located.numpy(), directions
+
+    def interpolate(self, features: Tensor) -> Tensor:
+        out = self.points.new_empty((self.points.shape[0], FEATURE_DIM * self.table.num_levels))
+        self.table.interpolate(view(features), *self._places, out.numpy(), threads())
+        return out
+
+    def scatter(self, out_grad: Tensor) -> Tensor:
+        features_grad = self.points.new_zeros((self.table.num_rows, FEATURE_DIM))
+        self.table.scatter(*self._places, rows_view(out_grad), features_grad.numpy(), threads())
+        return features_grad
+
+    def coordinate_gradient(self, features: Tensor, out_grad: Tensor) -> Tensor:
+        points_grad = torch.empty_like(self.points, memory_format=torch.contiguous_format)
+        arrays = *self._places, rows_view(out_grad), points_grad.numpy()
+        self.table.coordinate_gradient(view(features), *arrays, threads())
+        return points_grad
 
 
-def _interpolate(
-    table: VertexTable, features: Tensor, points: Tensor, located: Tensor, directions: Tensor | None
-) -> Tensor:
-    out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-    table.interpolate(view(features), *_places(points, located, directions), out.numpy(), threads())
-    return out
-
-
-def scatter(
-    table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
-) -> Tensor:
-    """Return the gradient (num_rows, 8) of Σ interpolated · out_grad by the features, or of its derivatives along `directions`."""
-    features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
-    places = _places(points, located, directions)
-    table.scatter(*places, rows_view(out_grad), features_grad.numpy(), threads())
-    return features_grad
-
-
-def _coordinate_gradient(
-    table: VertexTable,
-    features: Tensor,
-    points: Tensor,
-    located: Tensor,
-    directions: Tensor | None,
-    out_grad: Tensor,
-) -> Tensor:
-    points_grad = torch.empty_like(points, memory_format=torch.contiguous_format)
-    places = _places(points, located, directions)
-    table.coordinate_gradient(view(features), *places, rows_view(out_grad), points_grad.numpy(), threads())
-    return points_grad
-
-
-# The core computes y = W(x) F (interpolate), W(x)^T g (scatter) and d(y . g)/dx (coordinate_gradient). With a
-# direction v, all three use dW/dx . v instead of W. Their derivatives have the same form, so these suffice
-# for second derivatives.
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
@@ -116,9 +111,10 @@ class _InterpolateBackward(torch.autograd.Function):
         ctx.save_for_backward(out_grad, features, points, located)
         ctx.table = table
         ctx.set_materialize_grads(False)  # unused gradients are None, not zeros to interpolate
+        weights = _Weights(table, points, located)
         return (
-            scatter(table, points, located, None, out_grad) if needs_features else None,
-            _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
+            weights.scatter(out_grad) if needs_features else None,
+            weights.coordinate_gradient(features, out_grad) if needs_points else None,
         )
 
     @staticmethod
@@ -126,17 +122,17 @@ class _InterpolateBackward(torch.autograd.Function):
     def backward(ctx: Any, a: Tensor | None, v: Tensor | None) -> tuple[Tensor | None, ...]:
         # The scalar differentiated here is  a . W(x)^T g  +  v . d(W(x) F . g)/dx.
         g, features, points, located = ctx.saved_tensors
-        table = ctx.table
+        here = _Weights(ctx.table, points, located)
+        along = here._replace(directions=v)
         needs_g, needs_features, needs_points = ctx.needs_input_grad[:3]
-        of_each = ([] if a is None else [(a, None)]) + ([] if v is None else [(features, v)])
+        of_each = ([] if a is None else [(here, a)]) + ([] if v is None else [(along, features)])
         g_grad = features_grad = points_grad = None
         if needs_g and of_each:
-            terms = (_interpolate(table, f, points, located, along) for f, along in of_each)
-            g_grad = functools.reduce(torch.add, terms)
+            g_grad = functools.reduce(torch.add, (weights.interpolate(f) for weights, f in of_each))
         if needs_features and v is not None:
-            features_grad = scatter(table, points, located, v, g)
+            features_grad = along.scatter(g)
         if needs_points and of_each:
-            terms = (_coordinate_gradient(table, f, points, located, along, g) for f, along in of_each)
+            terms = (weights.coordinate_gradient(f, g) for weights, f in of_each)
             points_grad = functools.reduce(torch.add, terms)
         return g_grad, features_grad, points_grad, None, None, None, None
 
