@@ -164,9 +164,7 @@ def fit_tile(folder: str, name: str) -> None:
 
     def read() -> FitInput:
         rays, inside = read_rays(root, plan, tile)
-        radars = plan.radars_of(rays)
-        rays = rays if radars is None else radars.in_one_unit(rays)
-        limits = plan.intensity_range
+        limits, radars = plan.intensity_range, plan.radars_of(rays)
         scale = None if limits is None else IntensityScale.between(limits)
         names = ("clutter_ratio", "returns_per_cell", "sensor", "sensors")
         whole = {name: getattr(plan, name) for name in names}

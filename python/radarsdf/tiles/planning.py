@@ -284,7 +284,7 @@ def rays_path(folder: Path, tile: Tile) -> Path:
 
 
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
-    """Rays that cross a tile, in the frame of its map, intensities in the units of their radars; and the mask (N,) of returns in it or its halo."""
+    """Rays that cross a tile, in the frame of its map, with intensities in one unit; and the mask (N,) of returns in it or its halo."""
     path = rays_path(folder, tile.tile)
     whole = path.exists() and path.stat().st_size == tile.rays * _RECORD.itemsize
     wrong = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean"
@@ -303,7 +303,8 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
         values = np.full(len(rows), np.nan, np.float32)
         for radar, own in zip(plan.radars, rays.rows_of_sensors(), strict=True):
             if radar.intensity_range is not None:
-                values[own] = Plausible(*radar.intensity_range).kept(rows["intensity"][own])
+                kept = Plausible(*radar.intensity_range).kept(rows["intensity"][own])
+                values[own] = in_map_unit(kept, radar.sensor.unit)
         rays = dataclasses.replace(rays, intensities=values)
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
     (lower, upper), halo = plan.box_cells(tile.tile)[:, :2], round(plan.halo_m / plan.config.leaf_size_m)
