@@ -74,10 +74,8 @@ class ReturnsConfig:
     the map keeps the rays, 40 bytes each. They take 0.3 kB per block of 8 × 8 × 8 leaf cells that rays crossed."""
 
     def __post_init__(self) -> None:
-        fits = self.max_range_m is None or self.max_range_m > self.min_range_m
-        check(
-            fits, f"returns.max_range_m must exceed min_range_m, {self.min_range_m}, not {self.max_range_m}"
-        )
+        wrong = f"returns.max_range_m must exceed min_range_m, {self.min_range_m}, not {self.max_range_m}"
+        check(self.max_range_m is None or self.max_range_m > self.min_range_m, wrong)
 
 
 @settings

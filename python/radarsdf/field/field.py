@@ -178,7 +178,7 @@ class NeuralField(Field):
         self.table = self.cells.table
         self.half_width_m = config.metres(FOURIER_HALF_WIDTH_CELLS)
         self.num_frequencies = config.encoding.fourier_count
-        self.sdf_network = SDFNetwork(config)
+        self.sdf_network = SDFNetwork(sdf_widths(config))
         self.intensity_network = IntensityNetwork(config) if with_intensity else None
 
     def initialise(self, generator: torch.Generator) -> None:
@@ -270,9 +270,6 @@ class Network(nn.Module):
 
 class SDFNetwork(Network):
     """Decoder of the encoding of a point to signed distance / sigma, positive in free space, and a feature."""
-
-    def __init__(self, config: FitConfig) -> None:
-        super().__init__(sdf_widths(config))
 
     def forward(self, encoding: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Return logits (N,) and geometry features (N, geometry_feature_dim) of concatenated encodings (N, width)."""

@@ -302,12 +302,11 @@ class _Fit:
 def _report(
     given: FitInput, rays: Rays, surface: SurfaceReturns, field: Field, schedule: Schedule, config: FitConfig
 ) -> dict[str, Any]:
-    cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
-    sizes = {"returns": len(rays), "cells": cells, "rows": rows}
+    sizes = {"returns": len(rays), "cells": len(field.table.leaf_keys()), "rows": field.table.num_rows}
     skipped: list[tuple[str, float | None]] = []
     if given.why_none_moving is not None:
         skipped.append((f"leaving out what moves: {given.why_none_moving}", None))
-    skipped += skipped_parts(config, schedule, with_intensity=with_intensity, **sizes)
+    skipped += skipped_parts(config, schedule, with_intensity=given.scale is not None, **sizes)
     outliers = 0 if rays.intensities is None else len(rays) - int(rays.with_intensity.sum())
     return {
         "scans": len(given.rays.up_of_scan),
@@ -318,8 +317,8 @@ def _report(
         "intensity_outliers": outliers,
         "noise": dataclasses.asdict(surface.noise.mean),
         **({} if given.radars is None else {"sensors": given.radars.report(given.rays)}),
-        "leaf_cells": cells,
-        "vertices": rows,
+        "leaf_cells": sizes["cells"],
+        "vertices": sizes["rows"],
         "skipped": [words for words, _ in skipped],
         "skipped_s": [seconds for _, seconds in skipped],
         "iterations": schedule.iterations,

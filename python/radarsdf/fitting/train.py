@@ -79,7 +79,6 @@ class LossHistory:
         self._spans = {name: np.zeros((min(n, _MOST_SPANS), 3)) for name, n in iterations.items()}
         # A row for each loss: exponentially decaying sums of iterations, losses, and losses of the worst plausible prediction.
         self._recent = np.zeros((len(_WORST), 3))
-        self._started_s = time.perf_counter()
 
     def start(self) -> None:
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
