@@ -61,7 +61,6 @@ class TileBlend(Map):
 
     @cached_property
     def contents_of_any(self) -> MapContents:
-        """The map of any tile, for what all have in common."""
         return self.contents_of(self.tiles[0].tile)
 
     def contents_of(self, tile: Tile) -> MapContents:

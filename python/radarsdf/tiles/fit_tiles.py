@@ -1,5 +1,6 @@
 """Fits of maps of any size: scans to tiles, a fit per tile, and one map."""
 
+import hashlib
 import math
 import os
 import shutil
@@ -22,7 +23,7 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.scans import Scan, Scans
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
-from radarsdf.tiles.planning import SCANS_FILE, ScanStream, make_plan, read_rays
+from radarsdf.tiles.planning import SCANS_FILE, checked_scans, make_plan, read_rays
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
@@ -96,24 +97,20 @@ def plan_tiles(
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
-    given = ScanStream(read(scans) if isinstance(scans, (str, PathLike)) else scans)
+    digest = hashlib.blake2b(digest_size=16)
+    given = checked_scans(read(scans) if isinstance(scans, (str, PathLike)) else scans, digest)
     if not (folder / PLAN).is_file():
         folder.mkdir(exist_ok=True)
-        ours = {path.name for path in folder.iterdir()} <= _OURS
-        check(ours, f"{folder} holds other files: give a new folder")
+        others = {path.name for path in folder.iterdir()} - _OURS
+        check(not others, f"{folder} holds other files: give a new folder")
         with os.fdopen(take_lock(folder / _LOCK, "planned")):
             if not (folder / PLAN).is_file():  # another process may have just written it
                 shutil.rmtree(folder / TILES, ignore_errors=True)  # left by an unfinished plan
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
-                plan = make_plan(given, folder, config, grid)
+                plan = make_plan(given, digest, folder, config, grid)
                 plan.save(folder)
                 return plan
-    return _known_plan(folder, config, grid, given)
-
-
-def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: ScanStream) -> Plan:
-    """The plan in a folder. Raises a ValueError if it is of other scans or settings."""
-    plan = Plan.load(folder)
+    plan = Plan.load(folder)  # must be of the same scans and settings
     unknown = [name for name in NOISE_SETTINGS if getattr(config.returns, name) is None]
     found = {name: getattr(plan.config.returns, name) for name in unknown}
     ours, theirs = (settings_of_results(own) for own in (config.override(returns=found), plan.config))
@@ -123,7 +120,7 @@ def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: ScanStre
     if not different:
         for _ in given:
             pass
-        different += ["scans"] * (given.digest != plan.input_digest)
+        different += ["scans"] * (digest.hexdigest() != plan.input_digest)
     check(not different, f"{folder} holds another plan: {', '.join(different)} differ; give a new folder")
     return plan
 

@@ -171,11 +171,10 @@ class Plan:
     @property
     def intensity_range(self) -> tuple[float, float] | None:
         """Range of the intensities without outliers, in one unit. None: there are none."""
-        ends = [
-            in_map_unit(np.array(radar.intensity_range), radar.sensor.unit)
-            for radar in self.radars
-            if radar.intensity_range
+        known = [
+            (np.array(own.intensity_range), own.sensor.unit) for own in self.radars if own.intensity_range
         ]
+        ends = [in_map_unit(*own) for own in known]
         return (float(np.min(ends)), float(np.max(ends))) if ends else None
 
     @property

@@ -41,42 +41,36 @@ _SENSOR_SCANS = 512  # largest sample of scans for the sensor model
 _SAMPLED_TILES = 4  # tiles that estimate noise, units and clutter ratio
 
 
-class ScanStream:
-    """Scans that are checked one by one in each pass. Those without a rigid pose are skipped."""
-
-    def __init__(self, scans: Iterable[Any]) -> None:
-        self._scans = scans
-        self.digest = ""  # hash of all scans, after a pass
-
-    def __iter__(self) -> Iterator[Scan]:
-        digest = hashlib.blake2b(digest_size=16)
-        rigid = []
-        for i, scan in enumerate(one_for_each_scan(self._scans, "scans")):
-            if not isinstance(scan, Scan):
-                msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
-                raise TypeError(msg)
-            shape = np.shape(scan.T_world_sensor)
-            check(shape == (4, 4), f"scan {i} has no pose: T_world_sensor must be (4, 4), not {shape}")
-            for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
-                digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
-            digest.update(repr(scan.sensor).encode())
-            rigid.append(bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
-            if rigid[-1]:
-                yield scan
-        bad = np.flatnonzero(~np.array(rigid, bool)).tolist()
-        wrong = f"{len(bad)} of {len(rigid)} poses are not rigid transforms"
-        check(not bad or 2 * len(bad) < len(rigid), f"{wrong}, the first is pose {min(bad, default=0)}")
-        for note in LeftOut(poses=bad).notes:
-            _LOG.warning(note)
-        self.digest = digest.hexdigest()
+def checked_scans(scans: Iterable[Any], digest: hashlib.blake2b) -> Iterator[Scan]:
+    """Check scans one by one, add all to `digest`, and yield those with a rigid pose."""
+    rigid = []
+    for i, scan in enumerate(one_for_each_scan(scans, "scans")):
+        if not isinstance(scan, Scan):
+            msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
+            raise TypeError(msg)
+        shape = np.shape(scan.T_world_sensor)
+        check(shape == (4, 4), f"scan {i} has no pose: T_world_sensor must be (4, 4), not {shape}")
+        for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
+            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+        digest.update(repr(scan.sensor).encode())
+        rigid.append(bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
+        if rigid[-1]:
+            yield scan
+    bad = np.flatnonzero(~np.array(rigid, bool)).tolist()
+    wrong = f"{len(bad)} of {len(rigid)} poses are not rigid transforms"
+    check(not bad or 2 * len(bad) < len(rigid), f"{wrong}, the first is pose {min(bad, default=0)}")
+    for note in LeftOut(poses=bad).notes:
+        _LOG.warning(note)
 
 
-def make_plan(scans: ScanStream, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
-    """Read all scans once, write the rays of each tile, and return the plan."""
+def make_plan(
+    scans: Iterable[Scan], digest: hashlib.blake2b, folder: Path, config: FitConfig, grid: TileGrid
+) -> Plan:
+    """Read scans once, write the rays of each tile, and return the plan. `digest`: of the scans, after they are read."""
     planner = _Planner(folder, config, grid)
     for chunk in _chunks(scans, config.returns.accumulate_scans):
         planner.add(chunk)
-    return planner.plan(scans.digest)
+    return planner.plan(digest.hexdigest())
 
 
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
