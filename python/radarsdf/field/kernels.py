@@ -9,7 +9,7 @@ The core gets tensors as NumPy views of the same memory. Results are bit-identic
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from radarsdf import _core
 from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, VertexTable
 
 _CACHE_LINE = 64  # bytes
+_Views = list[np.ndarray[Any, Any]]
 
 
 def view(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -34,6 +35,12 @@ def rows_view(tensor: Tensor) -> np.ndarray[Any, Any]:
     """Return a view like :func:`view`, without copying a block of columns of a larger matrix."""
     tensor = tensor.detach()
     return (tensor if tensor.stride(1) == 1 and tensor.stride(0) > 0 else tensor.contiguous()).numpy()
+
+
+def layer_views(parameters: Iterable[Tensor]) -> tuple[_Views, _Views]:
+    """Return views of the weights and of the biases of linear layers, from both of each layer in turn."""
+    views = [view(parameter) for parameter in parameters]
+    return views[::2], views[1::2]
 
 
 def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -214,13 +221,8 @@ class _MLP(torch.autograd.Function):
         layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
         out = inputs[0].new_empty((inputs[0].shape[0], layers[-1].shape[0]))
         keep = any(ctx.needs_input_grad)
-        views = (
-            [rows_view(x) for x in inputs],
-            [view(w) for w in layers[::2]],
-            [view(b) for b in layers[1::2]],
-        )
+        ctx.views = views = [rows_view(x) for x in inputs], *layer_views(layers)
         ctx.hidden = _core.mlp(*views, out.numpy(), keep, threads())
-        ctx.views = views
         ctx.save_for_backward(*tensors)
         ctx.num_layers = num_layers
         return out
@@ -243,7 +245,7 @@ class _MLP(torch.autograd.Function):
         ]
         views: list[Any] = [None if g is None else g.numpy() for g in grads]
         by_weights, by_biases = (views[:split:2], views[1:split:2]) if by_layers else (None, None)
-        given: tuple[list[Any], list[Any], list[Any]] = ctx.views
+        given: tuple[_Views, _Views, _Views] = ctx.views
         _core.mlp_backward(
             *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
         )

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
-from torch import Generator, Tensor, nn
+from torch import Generator, Tensor
 from torch.nn import functional
 
 from radarsdf import _core
@@ -107,8 +107,8 @@ class CoreGradients(GradientBackend):
             table=field.cells.table,
             features=kernels.view(field.cells.features),
             frequencies=(field.half_width_m, field.num_frequencies),
-            sdf=_layers(field.sdf_network),
-            intensity=None if network is None else _layers(network),
+            sdf=kernels.layer_views(field.sdf_network.parameters()),
+            intensity=None if network is None else kernels.layer_views(network.parameters()),
             sees=(networks.view_direction, networks.log_range),
             sigma_m=field.sigma_m,
             intensity_in_free_space=config.training.intensity_in_free_space,
@@ -153,11 +153,6 @@ class CoreGradients(GradientBackend):
         by_features = torch.zeros_like(cells.features)
         cells.table.scatter(batch.points, touched.located, touched.gradient, by_features.numpy(), pool)
         return Gradients(found, [by_features, *networks], None), result
-
-
-def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
-    values = [kernels.view(parameter) for parameter in network.parameters()]
-    return values[::2], values[1::2]
 
 
 class AutogradGradients(GradientBackend):
