@@ -268,7 +268,7 @@ class _Fit:
                 "sensor": Sensor.of_rays(rays, given.poses, surface.noise.mean),
                 "sensors": {} if given.radars is None else given.radars.sensors(rays, given.poses),
             }
-        noise, true, box_cells = surface.noise, surface.true, given.box_cells
+        keys, noise, true, box_cells = field.table.leaf_keys(), surface.noise, surface.true, given.box_cells
 
         def free_space() -> FreeSpace:
             of_true = rays if true is None else rays.select(true)
@@ -290,9 +290,7 @@ class _Fit:
             report=_report(given, learnt, surface, field, schedule, config),
             origin=rays.origin,
             intensity_scale=scale,
-            evidence=Evidence.of(
-                returns, rays, field.table.leaf_keys(), leaf_m, num_threads, given.visibility
-            ),
+            evidence=Evidence.of(returns, rays, keys, leaf_m, num_threads, given.visibility),
             free_space=Deferred(free_space) if deferred else FreeSpace.none,
             view_statistics=Deferred(view_statistics) if deferred else ViewStatistics.none,
             **whole,

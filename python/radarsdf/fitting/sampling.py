@@ -163,8 +163,11 @@ class _Layout:
         taken = max(num_near, num_free)
         # The less frequent kind is spread evenly over the rays, so that it covers the whole scene too.
         near_rays, free_rays = (np.arange(n) * taken // max(n, 1) for n in (num_near, num_free))
+        # The labelled ones are evenly spaced, with jitter, since rays are drawn in runs.
+        jittered = np.arange(num_labelled) + np.arange(num_labelled) * _GOLDEN % 1
+        labelled = np.minimum(jittered * num_near // max(num_labelled, 1), num_near - 1)
         chosen = np.zeros(num_near, np.bool_)
-        chosen[_spread(num_labelled, num_near)] = True
+        chosen[labelled.astype(np.int64)] = True
         of_kinds = [near_rays[chosen], near_rays[~chosen], free_rays]
         shares = [np.diff(np.arange(parts + 1) * len(kind) // parts).tolist() for kind in of_kinds]
         sizes = [size for part in zip(*shares, strict=True) for size in part]
@@ -177,13 +180,6 @@ class _Layout:
         segments = np.array(rows, np.float32)
         sizes_and_labels = [(sum(part), part[0]) for part in zip(*shares, strict=True)]
         return cls(ray, number, (kinds == 2).astype(np.uint8), segments, sizes_and_labels)
-
-
-def _spread(count: int, of: int) -> Ints:
-    """Return `count` of range(`of`), ascending and evenly spaced, with jitter, since rays are drawn in runs."""
-    numbers = np.arange(count)
-    jittered = numbers + numbers * _GOLDEN % 1
-    return np.minimum(jittered * of // max(count, 1), of - 1).astype(np.int64)
 
 
 def draw_seed(generator: torch.Generator) -> int:

@@ -84,7 +84,11 @@ def _surface(city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = N
     """Surface in the leaf cells of a tile, world, m, with `steps` voxels along a cell's edge, and the number of the cells."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
-    cells = _cells_in(city, tile)
+    parts = []  # the cells of the tile's map, and those of others with a weight there
+    for other in city.done.intersection(neighbours(tile)):  # in any order: the cells are sorted below
+        theirs = city.leaf_cells(other, within=tile)
+        parts.append(theirs[city.plan.grid.within_half_a_halo(other, position(theirs + 0.5))])
+    cells = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
     if box is not None:
         lower, upper = box
         cells = cells[((position(cells + 1) >= lower) & (position(cells) <= upper)).all(axis=1)]
@@ -105,16 +109,6 @@ def _surface(city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = N
     vertices, faces = extract_cells(corners, distances_m, voxel_corners, **placement)
     evidence = city.evidence_at(vertices)
     return Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells)), found
-
-
-def _cells_in(city: TileBlend, tile: Tile) -> Ints:
-    """(C, 3) leaf cells in a tile, by lattice indices: those of its map, and of others with a weight there."""
-    parts = []
-    for other in city.done.intersection(neighbours(tile)):  # in any order: the cells are sorted below
-        cells = city.leaf_cells(other, within=tile)
-        centres = city.config.lattice.position(cells + 0.5)
-        parts.append(cells[city.plan.grid.within_half_a_halo(other, centres)])
-    return sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
 
 
 def _on_borders(city: TileBlend, vertices: Floats) -> Ints:
