@@ -231,12 +231,14 @@ class _MLP(torch.autograd.Function):
     def backward(ctx: Any, out_grad: Tensor) -> tuple[Tensor | None, ...]:
         tensors: tuple[Tensor, ...] = ctx.saved_tensors
         wanted: tuple[bool, ...] = ctx.needs_input_grad[1:]
+        split = 2 * ctx.num_layers
         if torch.is_grad_enabled():  # the gradient may be differentiated again, which the core cannot do
+            out = torch.cat(tensors[split:], 1)
+            for i in range(0, split, 2):
+                out = functional.linear(out if i == 0 else torch.relu(out), tensors[i], tensors[i + 1])
             chosen = [t for t, w in zip(tensors, wanted, strict=True) if w]
-            out = _plain(ctx.num_layers, tensors)
             found = iter(torch.autograd.grad(out, chosen, out_grad, create_graph=True))
             return None, *(next(found) if w else None for w in wanted)
-        split = 2 * ctx.num_layers
         by_layers = any(wanted[:split])  # the core computes all layers, hardly slower than one
         computed = [w or (by_layers and i < split) for i, w in enumerate(wanted)]
         grads = [
@@ -250,11 +252,3 @@ class _MLP(torch.autograd.Function):
             *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
         )
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
-
-
-def _plain(num_layers: int, tensors: Sequence[Tensor]) -> Tensor:
-    """Evaluate the network by PyTorch operations, which autograd can differentiate arbitrarily often."""
-    x = torch.cat(list(tensors[2 * num_layers :]), 1)
-    for i in range(num_layers):
-        x = functional.linear(x if i == 0 else torch.relu(x), tensors[2 * i], tensors[2 * i + 1])
-    return x

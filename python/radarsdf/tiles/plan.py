@@ -123,8 +123,6 @@ class TilePlan:
 
 @settings
 class RadarPlan:
-    """Radar of a rig."""
-
     label: int | str | None  # None: it is the only one
     sensor: Sensor  # with its noise, and its unit
     intensity_range: tuple[float, float] | None  # without outliers, its own units
