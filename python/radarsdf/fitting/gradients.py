@@ -79,7 +79,6 @@ class GradientBackend(ABC):
     ) -> None:
         self._field, self._config, self._pool = field, config, pool
         self._dropout_scale, self._generator = dropout, generator
-        self._moves_rows = config.moves_rows(field.intensity_network is not None)
 
     @abstractmethod
     def num_parts(self, batch_size: int) -> int:
@@ -148,7 +147,7 @@ class CoreGradients(GradientBackend):
         if losses == "joint":
             found["intensity"] = intensity
             networks += self._by_intensity
-        if self._moves_rows:
+        if self._config.moves_rows(self._field.intensity_network is not None):
             return Gradients(found, networks, touched), result
         by_features = torch.zeros_like(cells.features)
         cells.table.scatter(batch.points, touched.located, touched.gradient, by_features.numpy(), pool)
