@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from .calls import refusal
 pytest.importorskip("cyclonedds", reason="topics of ROS 2 need cyclonedds")
 pytest.importorskip("rosbags")
 from radarsdf.io.bag_messages import POSE_TYPES, TRANSFORM_TYPES, Message, Pose
+from radarsdf.io.bag_poses import Tracks
 from radarsdf.io.recordings import Request
-from radarsdf.io.ros2 import Node, Subscription, _Poses, make_message
+from radarsdf.io.ros2 import Node, Subscription, _RecentTrack, make_message
 
 SCENE = ground_and_wall(scans=12, returns_per_scan=600)
 DOMAIN = 100 + os.getpid() % 100
@@ -114,17 +116,16 @@ def test_it_maps_and_publishes(posed, tmp_path, node):
 def test_late_static_transforms_replace_an_assumed_mounting():
     scans = Subscription.__new__(Subscription)
     scans._request = Request(pose_topic="/odom", notes=Notes())
-    scans._poses = poses = _Poses(scans._request)
-    scans._frames, scans.unposed, scans._assumed = poses.frames, False, True
-    poses.add_frame("/radar/points", "radar")
+    scans._tracks, scans._frames, scans._lock = Tracks(_RecentTrack), {"/radar/points": "radar"}, Lock()
+    scans.unposed, scans._assumed = False, True
 
     def add(topic, message_type, time_s, child, parent, x):
         pose = Pose(time_s, parent, child, (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-        poses.add(Message(Path(), topic, message_type, time_s, 0, time_s, parent, [pose]))
+        scans._add(Message(Path(), topic, message_type, time_s, 0, time_s, parent, [pose]))
 
     for time_s in (1.0, 2.0):
         add("/odom", POSE_TYPES[0], time_s, "base", "odom", time_s)
-    assert poses.known() is poses.known()  # derived once
+    assert scans._known() is scans._known()  # derived once
     assert scans._find("radar").pose_at(1.5, 2.0)[0, 3] == 1.5
     assert not scans.remounted()
     add("/tf_static", TRANSFORM_TYPES[0], 3.0, "radar", "base", 2.0)

@@ -203,35 +203,104 @@ class _Known(NamedTuple):
     notes: list[str]
 
 
-class _Poses:
-    """Poses received so far: of a topic, or else of TF. They are added and used in two threads."""
+class Subscription:
+    """Scans of running topics, with poses of a topic or of TF; with `find`, or if TF has none, `unposed`. Iteration ends when `stopped`.
 
-    def __init__(self, request: Request) -> None:
-        self._request = request
+    A thread receives scans and poses, and keeps the last scans until they are taken.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topics: Sequence[str],
+        request: Request,
+        find: bool,
+        stopped: Callable[[], bool],
+        report: Callable[[str], None],
+    ) -> None:
+        self._node, self._topics, self._request = node, list(dict.fromkeys(topics)), request
+        self._stopped, self._report, self.unposed = stopped, report, find
         self._tracks = Tracks(_RecentTrack)
+        self._frames: dict[str, str] = {}  # by topic of scans
+        self._latest: _Known | None = None  # None since a pose or a first scan arrived
+        self._readers: dict[str, tuple[str, Any]] = {}
+        self._clocks: dict[str, Clock] = {}
+        self._error: Exception | None = None
+        self._queue: deque[tuple[float, RawScan]] = deque(maxlen=_QUEUED * len(self._topics))
+        self.dropped = 0  # scans that arrived faster than they were taken, or before the mountings
         self._lock = threading.Lock()
-        self._known: _Known | None = None  # None since a pose arrived
-        self.frames: dict[str, str] = {}  # by topic of scans
+        threading.Thread(target=self._listen, daemon=True).start()
+        self._await_poses()
+        self._assumed = self._is_assumed()
+        known = self._known()
+        for line in () if self.unposed else known.notes:
+            request.notes.add(line)
+        self.T_body_sensor = self._mounted() or None
+        self.world = request.world_frame or "map"
+        if not self.unposed and self._frames:
+            root = known.tree.chain(next(iter(self._frames.values())))[-1]
+            self.world = known.topic.parent if known.topic else request.world_frame or root
 
-    def add(self, message: Message) -> None:
-        with self._lock:
-            self._known = None
-            self._tracks.add(message)
+    def carrier(self, label: Label | None) -> tuple[str, Floats, bool]:
+        """Return the highest frame that TF attaches rigidly to a radar, T_carrier_sensor (4, 4), and whether others publish its pose."""
+        tree = self._known().tree
+        top, T_top_sensor = tree.rigid_top(self._frames[self._topics[0] if label is None else str(label)])
+        return top, T_top_sensor, top in tree.tracks
 
-    def add_frame(self, topic: str, frame: str) -> None:
-        with self._lock:
-            self._known = None
-            self.frames.setdefault(topic, frame)
+    def remounted(self) -> bool:
+        """Whether static transforms arrived only now, and the poses of a topic were taken as those of the radar meanwhile."""
+        before, self._assumed = self._assumed, self._is_assumed()
+        return before and not self._assumed
 
-    def known(self) -> _Known:
+    def _is_assumed(self) -> bool:
+        tree, topic = self._known().tree, self._known().topic
+        if topic is None or self._request.extrinsic is not None or not self._frames:
+            return False
+        sensor = next(iter(self._frames.values()))
+        top = tree.mounted_on(sensor)
+        return tree.mounted_on(topic.child) != top if topic.child else top == sensor
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Yield scans, with poses of the body if there are mountings, and note at the end what was left out."""
+        mounted = self.T_body_sensor
+        for scan in posed(self._raw_scans, self._find, self._request)():
+            if mounted is None:
+                yield replace(scan, sensor=None)
+            else:
+                T = scan.T_world_sensor @ np.linalg.inv(mounted[scan.sensor])
+                yield replace(scan, T_world_sensor=T)
+        self._request.notes.end_pass()
+
+    def _raw_scans(self) -> Iterator[RawScan]:
+        longest_s = self._request.max_gap_s
+        while self._queue or not self._stopped():
+            if not self._queue:
+                self._wait()
+                continue
+            with self._lock:
+                arrived_s, raw = self._queue.popleft()
+            while time.monotonic() < arrived_s + longest_s and not self._stopped():
+                poses = self._find(raw.frame)
+                if poses is None or poses.pose_at(raw.time_s or 0.0, longest_s) is not None:
+                    break
+                self._wait()  # the pose after the scan is yet to come
+            yield raw
+
+    def _wait(self) -> None:
+        """Wait for more messages. Raise the error of the thread, if there is one."""
+        if self._error is not None:
+            raise self._error
+        time.sleep(_STEP_S)
+
+    def _known(self) -> _Known:
         with self._lock:
-            self._known = self._known or self._derive()
-            return self._known
+            self._latest = self._latest or self._derive()
+            return self._latest
 
     def _derive(self) -> _Known:
         request, name = replace(self._request, notes=_Unlogged()), self._request.pose_topic
         tree, topics = self._tracks.tree(request), self._tracks.by_topic
-        frames = [*self.frames.values(), ""]
+        frames = [*self._frames.values(), ""]
         sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
         find: FindPoses = dict[str, Any]().get  # none of any frame
         error = None
@@ -245,40 +314,53 @@ class _Poses:
             error = why
         return _Known(tree, topics.get(name or ""), find, error, request.notes.lines)
 
+    def _find(self, frame: str) -> Any:
+        return UNPOSED if self.unposed else self._known().find(frame)
 
-class _Listener:
-    """Receives scans and poses in its own thread, and keeps the last scans until they are taken."""
+    def _mounted(self) -> dict[Label, Floats]:
+        """T_body_sensor by topic, of several radars; empty if TF does not mount all of them on one body."""
+        frames = dict(self._frames)
+        _, mounted = self._known().tree.mountings([*frames.values()] or [""])
+        complete = len(self._topics) > 1 and len(mounted) == len(set(frames.values()))
+        return {topic: mounted[frame] for topic, frame in frames.items()} if complete else {}
 
-    def __init__(self, node: Node, topics: list[str], request: Request, stopped: Callable[[], bool]) -> None:
-        self._node, self._topics, self._request, self._stopped = node, topics, request, stopped
-        self._poses = _Poses(request)
-        self._frames = self._poses.frames
-        self._readers: dict[str, tuple[str, Any]] = {}
-        self._clocks: dict[str, Clock] = {}
-        self._error: Exception | None = None
-        self._received, self._taken = 0, 0
-        self._queue: deque[tuple[float, RawScan]] = deque(maxlen=_QUEUED * len(topics))
-        threading.Thread(target=self._listen, daemon=True).start()
+    def _await_poses(self) -> None:
+        """Wait until poses of the scans are known, or that there are none; after a while, report for what."""
+        late_s, report_s = np.inf, time.monotonic() + 1.5 * _PATIENCE_S
+        while not self._stopped():
+            missing = [topic for topic in self._topics if topic not in self._frames]
+            why = f"messages of {', '.join(missing)}"
+            if not missing:
+                late_s = min(late_s, time.monotonic() + _PATIENCE_S)
+                why = self._missing(late=time.monotonic() > late_s)
+                if not why:
+                    return
+            if time.monotonic() > report_s:
+                report_s = np.inf
+                found = self._node.published()
+                listed = ", ".join(f"{name} ({', '.join(types)})" for name, types in sorted(found.items()))
+                self._report(f"waiting for {why}; DDS domain {self._node.domain} has {listed or 'no topics'}")
+            self._wait()
 
-    @property
-    def dropped(self) -> int:
-        """Number of scans that arrived faster than they were taken, or before the mountings."""
-        return self._received - self._taken - len(self._queue)
-
-    def _wait(self) -> None:
-        """Wait for more messages. Raise the error of the thread, if there is one."""
-        if self._error is not None:
-            raise self._error
-        time.sleep(_STEP_S)
-
-    def _take(self) -> Iterator[tuple[float, RawScan]]:
-        """Yield scans and the times of their arrival, by the monotonic clock, until it is stopped."""
-        while self._queue or not self._stopped():
-            if self._queue:
-                self._taken += 1
-                yield self._queue.popleft()
-            else:
-                self._wait()
+    def _missing(self, *, late: bool) -> str:
+        """Return what is missing for the poses of the scans. Only `late`, it is certain that TF has none."""
+        known = self._known()
+        without = self._request.pose_topic is None and isinstance(known.error, NoPoses)
+        if late and without and not self.unposed:
+            self.unposed = True
+            self._request.notes.add("TF has no poses of the radar: they are estimated from its returns")
+        if len(self._topics) > 1 and (self.unposed or known.topic) and not self._mounted():
+            return f"static transforms that mount {', '.join(self._frames.values())} on one body"
+        if self.unposed:
+            return ""
+        if known.error is not None:
+            return str(known.error)
+        unposed = [frame for frame in self._frames.values() if known.find(frame) is None]
+        if unposed:
+            return f"transforms from the poses to {', '.join(unposed)}"
+        # Static transforms may arrive after odometry.
+        attached = known.tree.tracks.keys() >= set(self._frames.values())
+        return "" if late or attached else "static transforms of the radars"
 
     def _listen(self) -> None:
         """Subscribe to topics once they are there, and receive their messages."""
@@ -319,129 +401,22 @@ class _Listener:
             self._request.notes.count("messages left out: they cannot be decoded", example=what)
             return
         if topic not in self._topics:
-            self._poses.add(Message(Path(), topic, message_type, recorded_s, 0, stamp_s, frame, content))
+            self._add(Message(Path(), topic, message_type, recorded_s, 0, stamp_s, frame, content))
             return
         if topic not in self._clocks:
             both = np.array([[stamp_s], [recorded_s]])
             self._clocks[topic] = Clock.of(both, topic, self._request.stamps, self._request.notes)
-            self._poses.add_frame(topic, frame)
         time_s = float(self._clocks[topic].times(stamp_s, recorded_s))
         label = topic if len(self._topics) > 1 else None
         name = f"{topic} at {time_s:.3f} s"
         raw = RawScan(partial(dict, content), time_s, name, frame, topic, sensor=label)
-        self._received += 1
-        self._queue.append((time.monotonic(), raw))
+        with self._lock:
+            if topic not in self._frames:
+                self._frames[topic], self._latest = frame, None
+            self.dropped += len(self._queue) == self._queue.maxlen
+            self._queue.append((time.monotonic(), raw))
 
-
-class Subscription(_Listener):
-    """Scans of running topics, with poses of a topic or of TF; with `find`, or if TF has none, `unposed`. Iteration ends when `stopped`."""
-
-    def __init__(
-        self,
-        node: Node,
-        topics: Sequence[str],
-        request: Request,
-        find: bool,
-        stopped: Callable[[], bool],
-        report: Callable[[str], None],
-    ) -> None:
-        super().__init__(node, list(dict.fromkeys(topics)), request, stopped)
-        self._report, self.unposed = report, find
-        self._await_poses()
-        self._assumed = self._is_assumed()
-        known = self._poses.known()
-        for line in () if self.unposed else known.notes:
-            request.notes.add(line)
-        self.T_body_sensor = self._mounted() or None
-        self.world = request.world_frame or "map"
-        if not self.unposed and self._frames:
-            root = known.tree.chain(next(iter(self._frames.values())))[-1]
-            self.world = known.topic.parent if known.topic else request.world_frame or root
-
-    def carrier(self, label: Label | None) -> tuple[str, Floats, bool]:
-        """Return the highest frame that TF attaches rigidly to a radar, T_carrier_sensor (4, 4), and whether others publish its pose."""
-        tree = self._poses.known().tree
-        top, T_top_sensor = tree.rigid_top(self._frames[self._topics[0] if label is None else str(label)])
-        return top, T_top_sensor, top in tree.tracks
-
-    def remounted(self) -> bool:
-        """Whether static transforms arrived only now, and the poses of a topic were taken as those of the radar meanwhile."""
-        before, self._assumed = self._assumed, self._is_assumed()
-        return before and not self._assumed
-
-    def _is_assumed(self) -> bool:
-        tree, topic = self._poses.known().tree, self._poses.known().topic
-        if topic is None or self._request.extrinsic is not None or not self._frames:
-            return False
-        sensor = next(iter(self._frames.values()))
-        top = tree.mounted_on(sensor)
-        return tree.mounted_on(topic.child) != top if topic.child else top == sensor
-
-    def __iter__(self) -> Iterator[Scan]:
-        """Yield scans, with poses of the body if there are mountings, and note at the end what was left out."""
-        mounted = self.T_body_sensor
-        for scan in posed(self._raw_scans, self._find, self._request)():
-            if mounted is None:
-                yield replace(scan, sensor=None)
-            else:
-                T = scan.T_world_sensor @ np.linalg.inv(mounted[scan.sensor])
-                yield replace(scan, T_world_sensor=T)
-        self._request.notes.end_pass()
-
-    def _raw_scans(self) -> Iterator[RawScan]:
-        longest_s = self._request.max_gap_s
-        for arrived_s, raw in self._take():
-            while time.monotonic() < arrived_s + longest_s and not self._stopped():
-                poses = self._find(raw.frame)
-                if poses is None or poses.pose_at(raw.time_s or 0.0, longest_s) is not None:
-                    break
-                self._wait()  # the pose after the scan is yet to come
-            yield raw
-
-    def _find(self, frame: str) -> Any:
-        return UNPOSED if self.unposed else self._poses.known().find(frame)
-
-    def _mounted(self) -> dict[Label, Floats]:
-        """T_body_sensor by topic, of several radars; empty if TF does not mount all of them on one body."""
-        frames = dict(self._frames)
-        _, mounted = self._poses.known().tree.mountings([*frames.values()] or [""])
-        complete = len(self._topics) > 1 and len(mounted) == len(set(frames.values()))
-        return {topic: mounted[frame] for topic, frame in frames.items()} if complete else {}
-
-    def _await_poses(self) -> None:
-        """Wait until poses of the scans are known, or that there are none; after a while, report for what."""
-        late_s, report_s = np.inf, time.monotonic() + 1.5 * _PATIENCE_S
-        while not self._stopped():
-            missing = [topic for topic in self._topics if topic not in self._frames]
-            why = f"messages of {', '.join(missing)}"
-            if not missing:
-                late_s = min(late_s, time.monotonic() + _PATIENCE_S)
-                why = self._missing(late=time.monotonic() > late_s)
-                if not why:
-                    return
-            if time.monotonic() > report_s:
-                report_s = np.inf
-                found = self._node.published()
-                listed = ", ".join(f"{name} ({', '.join(types)})" for name, types in sorted(found.items()))
-                self._report(f"waiting for {why}; DDS domain {self._node.domain} has {listed or 'no topics'}")
-            self._wait()
-
-    def _missing(self, *, late: bool) -> str:
-        """Return what is missing for the poses of the scans. Only `late`, it is certain that TF has none."""
-        known = self._poses.known()
-        without = self._request.pose_topic is None and isinstance(known.error, NoPoses)
-        if late and without and not self.unposed:
-            self.unposed = True
-            self._request.notes.add("TF has no poses of the radar: they are estimated from its returns")
-        if len(self._topics) > 1 and (self.unposed or known.topic) and not self._mounted():
-            return f"static transforms that mount {', '.join(self._frames.values())} on one body"
-        if self.unposed:
-            return ""
-        if known.error is not None:
-            return str(known.error)
-        unposed = [frame for frame in self._frames.values() if known.find(frame) is None]
-        if unposed:
-            return f"transforms from the poses to {', '.join(unposed)}"
-        # Static transforms may arrive after odometry.
-        attached = known.tree.tracks.keys() >= set(self._frames.values())
-        return "" if late or attached else "static transforms of the radars"
+    def _add(self, poses: Message) -> None:
+        with self._lock:
+            self._latest = None
+            self._tracks.add(poses)
