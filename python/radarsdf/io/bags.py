@@ -60,21 +60,19 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, clocks[topic.name], request) for topic in scan_topics]
-        merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
-        return streams[0] if radars is None else map(radars.labelled, merged)
+        return map(radars.labelled, heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0))
 
     def find_given(known: Poses) -> FindPoses:
         """Poses passed by the user, of the body of several radars or else of the most frequent frame among the first scans."""
-        mounted = None if radars is None or request.extrinsic is not None else radars.mounted
+        mounted = {} if request.extrinsic is not None else radars.mounted
         if isinstance(known, (np.ndarray, NumberedPoses)):  # in the order of the scans
             count = scan_topics[0].num_messages if len(scan_topics) == 1 else sum(1 for _ in raw_scans())
             numbered_poses, _ = scan_poses(known, count, None, request.extrinsic, request)
-            of_frames = {frame: poses_on(numbered_poses, T) for frame, T in (mounted or {}).items()}
+            of_frames = {frame: poses_on(numbered_poses, T) for frame, T in mounted.items()}
             return of_frames.get if of_frames else lambda _: numbered_poses
         if known is UNPOSED:
             return lambda _: known
-        base = radars.body if radars is not None and mounted else frames[0]
-        return transforms_in(paths, request).attach(known, base, request)
+        return transforms_in(paths, request).attach(known, radars.body if mounted else frames[0], request)
 
     if in_bag:
         pose_paths = paths if poses is None else [Path(poses)]
@@ -83,16 +81,16 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         request.refuse("poses are given", "pose_topic", "world_frame")
         find = find_given(poses_of(poses, request.notes))
     imu_topic, recorded = _imu_topic(topics, request), clocks[scan_topics[0].name].recorded
-    body = frames[0] if radars is None else radars.body
-    imu = partial(_read_imu, paths, imu_topic, body, recorded, request) if imu_topic else lambda: None
-    mountings = (lambda: None) if radars is None else partial(radars.mountings, find)
-    return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu, mountings=mountings)
+    imu = partial(_read_imu, paths, imu_topic, radars.body, recorded, request) if imu_topic else lambda: None
+    source = partial(posed, raw_scans, find, request)
+    return Scans.of_source(source, request.notes, imu=imu, mountings=partial(radars.mountings, find))
 
 
 @dataclass(frozen=True)
 class _Radars:
-    """Several radars of a bag, each with its own topic or frame."""
+    """Radars of a bag, each with its own topic or frame."""
 
+    several: bool
     one_topic: bool
     body: str  # frame to which all are attached, or else the most frequent one of the scans
     mounted: dict[str, Floats]  # T_body_sensor (4, 4) by frame; empty if they are unknown
@@ -101,10 +99,10 @@ class _Radars:
     @classmethod
     def of(
         cls, paths: list[Path], topics: list[Topic], frames: list[str], request: Request, *, partly: bool
-    ) -> "_Radars | None":
-        """Find the mountings in TF; `partly`: even if others are unknown. None if there are one topic and one frame."""
+    ) -> "_Radars":
+        """Find the mountings of several radars in TF; `partly`: even if others are unknown."""
         if len(topics) == len(frames) == 1:
-            return None
+            return cls(False, True, frames[0], {})
         body, mounted = transforms_in(paths, request).mountings(frames)
         # A frame that topics share does not tell where their radars are.
         if len(frames) < len(topics) or (len(mounted) < len(frames) and not partly):
@@ -112,10 +110,12 @@ class _Radars:
         listed = ", ".join(mounted or frames)
         words = f"mountings: TF, {body} -> {listed}" if mounted else f"no mountings are known of {listed}"
         request.notes.add(f"{words}: poses are those of {body if mounted else 'each radar'}")
-        return cls(len(topics) == 1, body, mounted)
+        return cls(True, len(topics) == 1, body, mounted)
 
     def labelled(self, raw: RawScan) -> RawScan:
-        """Label a scan by its topic or, of one topic, by its frame."""
+        """Label a scan of several radars by its topic or, of one topic, by its frame."""
+        if not self.several:
+            return raw
         label = raw.frame if self.one_topic else raw.topic
         if self.frames.setdefault(label, raw.frame) != raw.frame:
             label = f"{raw.topic} {raw.frame}"
@@ -123,10 +123,10 @@ class _Radars:
         return replace(raw, sensor=label, number=raw.number if self.one_topic else None)
 
     def mountings(self, find: FindPoses) -> dict[str, Floats] | None:
-        """T_body_sensor by label, of the radars whose scans have poses; None unless all are known."""
+        """T_body_sensor by label, of several radars whose scans have poses; None unless all are known."""
         frames = {label: frame for label, frame in self.frames.items() if find(frame) is not None}
         known = {label: self.mounted[frame] for label, frame in frames.items() if frame in self.mounted}
-        return known if len(known) == len(frames) else None
+        return known if self.several and len(known) == len(frames) else None
 
 
 def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:

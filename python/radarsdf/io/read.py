@@ -199,5 +199,7 @@ def _npz(path: Path, request: recordings.Request) -> Scans:
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
     of_radars = {label: recordings.poses_on(matched, T) for label, T in (mountings or {}).items()}
-    source = recordings.posed(lambda: raw_scans, lambda label: of_radars.get(label, matched), request)
+    source = partial(
+        recordings.posed, lambda: raw_scans, lambda label: of_radars.get(label, matched), request
+    )
     return Scans.of_source(source, notes, lambda: truth, lambda: imu, lambda: mountings)

@@ -46,9 +46,6 @@ SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, "calib.txt", BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
 
-Truth = Callable[[], Floats | None]
-"""Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
-
 FindPoses = Callable[[str], StampedPoses | Floats | None]
 
 # Arguments of :func:`radarsdf.io.read` that only bags, and only scans with poses, can use.
@@ -105,37 +102,33 @@ class RawScan:
 
 def posed(
     raw_scans: Callable[[], Iterable[RawScan]], find_poses: FindPoses, request: Request
-) -> Callable[[], Iterator[Scan]]:
-    """Source for :meth:`Scans.of_source`: scans with poses and at least one return, in the order of the files."""
+) -> Iterator[Scan]:
+    """Yield scans with poses and at least one return, in the order of the files, for :meth:`Scans.of_source`."""
     notes = request.notes
-
-    def source() -> Iterator[Scan]:
-        layouts: dict[tuple[str, ...], Fields] = {}
-        num_posed, unposed = 0, ""
-        for number, raw in enumerate(raw_scans()):
-            known = find_poses(raw.frame)
-            if known is None:
-                notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}")
+    layouts: dict[tuple[str, ...], Fields] = {}
+    num_posed, unposed = 0, ""
+    for number, raw in enumerate(raw_scans()):
+        known = find_poses(raw.frame)
+        if known is None:
+            notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}")
+            continue
+        if isinstance(known, np.ndarray):
+            own = known[number if raw.number is None else raw.number :][:1]
+            if not np.isfinite(own).all() or not len(own):  # reported when the poses were read
                 continue
-            if isinstance(known, np.ndarray):
-                own = known[number if raw.number is None else raw.number :][:1]
-                if not np.isfinite(own).all() or not len(own):  # reported when the poses were read
-                    continue
-                T_world_sensor = own[0]
-            else:
-                found = known.pose_at(np.nan if raw.time_s is None else raw.time_s, request.max_gap_s)
-                if found is None:
-                    notes.count(f"scans left out: no poses within {request.max_gap_s} s of each other")
-                    unposed = unposed or f"first scan at {raw.time_s} s, poses from {known.span()}"
-                    continue
-                T_world_sensor = found
-            num_posed += 1
-            if scan := _scan(raw, T_world_sensor, layouts, request):
-                yield replace(scan, sensor=raw.sensor)
-        what = f"no scan has a pose: {unposed}, gaps up to {request.max_gap_s} s: do both use one clock?"
-        check(num_posed or not unposed, f"{notes.about}: {what}")
-
-    return source
+            T_world_sensor = own[0]
+        else:
+            found = known.pose_at(np.nan if raw.time_s is None else raw.time_s, request.max_gap_s)
+            if found is None:
+                notes.count(f"scans left out: no poses within {request.max_gap_s} s of each other")
+                unposed = unposed or f"first scan at {raw.time_s} s, poses from {known.span()}"
+                continue
+            T_world_sensor = found
+        num_posed += 1
+        if scan := _scan(raw, T_world_sensor, layouts, request):
+            yield replace(scan, sensor=raw.sensor)
+    what = f"no scan has a pose: {unposed}, gaps up to {request.max_gap_s} s: do both use one clock?"
+    check(num_posed or not unposed, f"{notes.about}: {what}")
 
 
 def _scan(
@@ -189,7 +182,9 @@ def poses_on(poses: StampedPoses | Floats, T_base_sensor: Floats) -> StampedPose
     return poses @ T_base_sensor if isinstance(poses, np.ndarray) else TransformChain((poses, T_base_sensor))
 
 
-def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
+def read_files(
+    files: list[Path], folder: Path, request: Request, truth: Callable[[], Floats | None] = lambda: None
+) -> Scans:
     """Read scans from files, one each, with the poses of the request or those found in or near the folder."""
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
@@ -216,7 +211,7 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     stamps: Sequence[float | None] = known_s or [None] * len(files)
     reads = zip(files, stamps, strict=True)
     raw_scans = [RawScan(partial(read_columns, path, columns), time_s, str(path)) for path, time_s in reads]
-    source = posed(lambda: raw_scans, lambda _: matched, request)
+    source = partial(posed, lambda: raw_scans, lambda _: matched, request)
     return Scans.of_source(source, notes, truth)
 
 

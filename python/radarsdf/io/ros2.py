@@ -263,7 +263,7 @@ class Subscription:
     def __iter__(self) -> Iterator[Scan]:
         """Yield scans, with poses of the body if there are mountings, and note at the end what was left out."""
         mounted = self.T_body_sensor
-        for scan in posed(self._raw_scans, self._find, self._request)():
+        for scan in posed(self._raw_scans, self._find, self._request):
             if mounted is None:
                 yield replace(scan, sensor=None)
             else:
