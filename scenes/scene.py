@@ -12,8 +12,8 @@ from radarsdf import FitConfig, RadarMap
 from radarsdf.checks import check_box
 from radarsdf.evaluation import holdout
 from radarsdf.io import read
-from radarsdf.io.datasets import find
 from radarsdf.io.npz import read_scans
+from radarsdf.io.read import find_dataset
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.scans import Scans
 from radarsdf.simulate import SCENES, Simulation
@@ -227,7 +227,7 @@ def _file(path: Path, frames: int | None) -> Scene:
 
 def _folder(path: Path, frames: int | None) -> Scene:
     scene = _recorded(path.resolve().name, read(path), frames)
-    dataset = find(path)
+    dataset = find_dataset(path)
     is_snail_radar = dataset is not None and dataset.name == "SNAIL-Radar"
     return dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M) if is_snail_radar else scene
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.datasets import find
+from radarsdf.io.read import find_dataset
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose
@@ -49,7 +49,7 @@ def tum_rows(times_s=TIMES_S, poses=POSES):
 
 
 def name_of(folder):
-    return find(folder).name
+    return find_dataset(folder).name
 
 
 @pytest.fixture
