@@ -116,11 +116,6 @@ class TransformTree:
             T_top_frame = track.matrix @ T_top_frame
         return top, T_top_frame
 
-    def fixed(self, base: str, sensor: str) -> Floats | None:
-        """T_base_sensor (4, 4) if the two frames are rigidly attached; None if they are not, or are unknown."""
-        (top, T_top_base), (other, T_top_sensor) = self.rigid_top(base), self.rigid_top(sensor)
-        return np.linalg.inv(T_top_base) @ T_top_sensor if top == other else None
-
     def mountings(self, frames: Sequence[str]) -> tuple[str, dict[str, Floats]]:
         """Return the highest frame rigidly attached to all known ones of `frames`, and T_top_frame of each; else the first, and none."""
         known = {*self.tracks, *(track.parent for track in self.tracks.values())}
@@ -196,15 +191,12 @@ class Tracks:
 
     def tree(self, request: Request) -> TransformTree:
         """Tree of the transforms. Of a frame with several parents, one is chosen and noted."""
-        edges = {}
+        edges, wanted = {}, (request.world_frame or "").lstrip("/")
+        rank = lambda t: (t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1))
         for child, tracks in self._parents.items():
             options = [track for track in tracks.values() if len(track.table)]
             if options:
-                wanted = (request.world_frame or "").lstrip("/")
-                ranks = [
-                    (t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1)) for t in options
-                ]
-                edges[child] = options[ranks.index(max(ranks))]
+                edges[child] = max(options, key=rank)
             if len(options) > 1:
                 request.notes.add(f"{child} has several parents in TF: {edges[child].parent} is used")
         return TransformTree(edges)
@@ -212,7 +204,7 @@ class Tracks:
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
     topics = topics_with(bag_messages.TRANSFORM_TYPES, bag_messages.topics_of(paths))
-    return _tracks_and_tree(paths, set(), set(topics), request)[1]
+    return _tracks_in(paths, set(topics), request).tree(request)
 
 
 def poses_in_bags(paths: list[Path], request: Request, frames: list[str], preferred: str | None) -> FindPoses:
@@ -225,7 +217,10 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     known = wanted is None or wants_tf or wanted in fitting
     check(known, f"{paths[0]} has no poses in {wanted}: topics with poses are {listed}")
     names = {n for n in fitting if not _DESIRED_POSE.search(n)} if wanted is None else fitting & {wanted}
-    tracks, tree = _tracks_and_tree(paths, names, transforms, request)
+    found = _tracks_in(paths, names | transforms, request)
+    tree = found.tree(request)
+    # Topics with a single pose are left out.
+    tracks = {n: t for n, t in found.by_topic.items() if len(np.unique(t.table[:, :2], axis=0)) > 1}
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
     name, find = "" if wants_tf else wanted or _choose(tracks, tree, sensor, preferred), None
     try:
@@ -243,15 +238,11 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     return find or topic_poses(name, tracks, tree, sensor, request)
 
 
-def _tracks_and_tree(
-    paths: list[Path], pose_topics: set[str], transform_topics: set[str], request: Request
-) -> tuple[dict[str, Track], TransformTree]:
-    """Read the poses of `pose_topics` and the transforms in one pass through the bags. Topics with a single pose are left out."""
+def _tracks_in(paths: list[Path], topics: set[str], request: Request) -> Tracks:
     tracks = Tracks()
-    for message in bag_messages.read_messages(paths, pose_topics | transform_topics, request.notes):
+    for message in bag_messages.read_messages(paths, topics, request.notes):
         tracks.add(message)
-    moving = {n: t for n, t in tracks.by_topic.items() if len(np.unique(t.table[:, :2], axis=0)) > 1}
-    return moving, tracks.tree(request)
+    return tracks
 
 
 def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferred: str | None) -> str:

@@ -204,6 +204,8 @@ def _read_imu(bags: list[Path], topic: str, radar_frame: str, recorded: bool, re
     has_force = np.isfinite(forces).all() and forces.any()
     R_sensor_imu = request.R_sensor_imu
     if R_sensor_imu is None and frame:
-        T_imu_sensor = transforms_in(bags, request).fixed(frame, radar_frame)
-        R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
+        tree = transforms_in(bags, request)
+        (top, T_top_imu), (other, T_top_sensor) = tree.rigid_top(frame), tree.rigid_top(radar_frame)
+        if top == other:  # both are attached to it
+            R_sensor_imu = (np.linalg.inv(T_top_imu) @ T_top_sensor)[:3, :3].T
     return Imu(times_s[order], table[order, 2:5], forces if has_force else None, R_sensor_imu)
