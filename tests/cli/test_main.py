@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.cli import main, message_of
+from radarsdf.cli import Results, main, message_of
 from radarsdf.cli.inputs import read_scans
 from radarsdf.cli.options import COMMANDS, OPTIONS, TILE_STEPS, Parser
-from radarsdf.cli.results import Results
 from radarsdf.cli.settings import load_config
 
 from .calls import call, refusal

@@ -8,11 +8,11 @@ from importlib.util import find_spec
 
 import radarsdf
 from radarsdf import Interrupted, RadarMap
+from radarsdf.cli import Results
 from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, scans_or_unposed, split, without_intensities
 from radarsdf.cli.maps import add_report, evaluate, mesh
 from radarsdf.cli.maps import view as show_map
 from radarsdf.cli.options import LIMITS, Parser, refuse_if
-from radarsdf.cli.results import Results
 from radarsdf.cli.scans import posed_scans, warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io import Scans, write_scans

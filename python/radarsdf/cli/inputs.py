@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from radarsdf.checks import check_pose
+from radarsdf.cli import warn
 from radarsdf.cli.options import GROUPS, LIMITS, refuse_if
-from radarsdf.cli.results import warn
 from radarsdf.evaluation import holdout
 from radarsdf.io.columns import read_numbers
 from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
@@ -29,7 +29,6 @@ def is_map(path: Path) -> bool:
 
 
 def load_map(path: Path) -> Map:
-    """Load a map, with a warning if tiles are missing."""
     radar_map = load(path)
     if tiles := lacking(radar_map):
         warn(f"warning: {path} lacks {tiles}: radarsdf tiles status {path} lists the reasons")
@@ -69,10 +68,8 @@ def request_of_topics(given: Namespace) -> Request | None:
     """Check the options of running topics; None if there are none."""
     one = bool(given.ros2) != (given.scans is not None)
     refuse_if(not one, "give either a recording or, as --ros2 TOPIC, topics of running nodes")
-    refuse_if(
-        given.scans and (given.ros2_odom or given.ros2_domain), "--ros2-odom and --ros2-domain need --ros2"
-    )
     if given.scans:
+        refuse_if(given.ros2_odom or given.ros2_domain, "--ros2-odom and --ros2-domain need --ros2")
         return None
     of_files = "--topic", "--pose-topic", "--imu-topic", "--imu-rotation", "--columns"
     _refuse_useless(given, of_files, "--ros2 reads no file")

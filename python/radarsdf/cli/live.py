@@ -13,9 +13,9 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
+from radarsdf.cli import Results, until_stopped, warn
 from radarsdf.cli.inputs import inputs_of, request_of_topics, scans_or_unposed
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, until_stopped, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.interrupts import deferred_interrupts

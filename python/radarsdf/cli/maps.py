@@ -14,9 +14,9 @@ from radarsdf import evaluation
 from radarsdf.arrays import Floats
 from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
+from radarsdf.cli import Results, until_stopped
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, until_stopped
 from radarsdf.cli.scans import add_scans, located, unposed_scans
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.extras import require

@@ -16,8 +16,6 @@ def refuse_if(wrong: object, message: str) -> None:
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser of the arguments of a command, or of a step such as ``tiles fit``."""
-
     def __init__(self, command: str) -> None:
         _, arguments, text, names_and_groups = ENTRIES[command]
         usage = " ".join(filter(None, ("radarsdf", command, arguments, "[OPTIONS]...")))
@@ -238,7 +236,6 @@ ENTRIES |= {f"tiles {step}": entry for step, entry in TILE_STEPS.items()}
 
 
 def overview() -> str:
-    """Format the help of ``radarsdf`` without a command."""
     lists = "\n\n".join(f"{heading}:\n{_rows(commands)}" for heading, commands in COMMANDS.items())
     return f"""\
 Usage: radarsdf COMMAND [OPTIONS]...

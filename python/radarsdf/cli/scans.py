@@ -13,9 +13,9 @@ from radarsdf import FitConfig
 from radarsdf.arrays import Floats
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
+from radarsdf.cli import Results, as_json, warn
 from radarsdf.cli.inputs import inputs_of, load_map, read_scans, scans_if, scans_or_unposed
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, as_json, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
 from radarsdf.io.clouds import CLOUD_OUT_SUFFIXES, CLOUD_SUFFIXES, write_cloud
@@ -32,7 +32,6 @@ from radarsdf.scans import Scans
 
 
 def check(given: Namespace, results: Results) -> int:
-    """Print the findings, worst first, and return status 1 if one is an error."""
     findings = radarsdf.check(read_scans(given), config=load_config(given))
     for finding in findings:
         results.add(str(finding))
@@ -198,7 +197,6 @@ def locate(given: Namespace, results: Results) -> None:
 
 
 def unposed_scans(given: Namespace) -> Scans:
-    """Read scans that are to be localised."""
     refuse_if(given.poses, f"scans that are localised need no poses: leave out {given.poses}")
     return read_scans(given, UNPOSED)
 

@@ -5,8 +5,8 @@ import platform
 from argparse import Namespace
 from typing import Any
 
+from radarsdf.cli import Results
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results
 from radarsdf.config.fit_config import FitConfig, read_toml, to_toml
 
 

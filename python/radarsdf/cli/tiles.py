@@ -6,9 +6,9 @@ from argparse import Namespace
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 
+from radarsdf.cli import Results, warn
 from radarsdf.cli.inputs import mesh_limits, read_scans, without_intensities
 from radarsdf.cli.options import refuse_if
-from radarsdf.cli.results import Results, warn
 from radarsdf.cli.scans import warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
