@@ -395,10 +395,8 @@ def _checked_obstacles(obstacles: ArrayLike | None) -> Floats:
     if boxes.ndim == 2:
         boxes = np.stack([boxes, boxes], axis=1)
     fits = boxes.shape[1:] == (2, 3) and np.isfinite(boxes).all() and (boxes[:, 0] <= boxes[:, 1]).all()
-    check(
-        fits,
-        f"obstacles must be finite points (K, 3) or boxes (K, 2, 3), not {boxes.shape} or upper corners first",
-    )
+    wanted = "finite points (K, 3) or boxes (K, 2, 3)"
+    check(fits, f"obstacles must be {wanted}, not {boxes.shape} or upper corners first")
     return boxes
 
 

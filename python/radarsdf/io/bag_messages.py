@@ -6,7 +6,7 @@ definitions, and old ROS 2 bags have none.
 
 import heapq
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import cache, partial
 from operator import itemgetter
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from radarsdf.arrays import Bools, Floats, Floats32
+from radarsdf.arrays import Bools, Floats
 from radarsdf.checks import check
 from radarsdf.extras import require
 from radarsdf.io.files import check_regular_file
@@ -58,6 +58,7 @@ _ARS548_RETURN = np.dtype(
      ("others", "V10")]
 )  # fmt: skip
 _ARS548_VALUES = [name for name in _ARS548_RETURN.names or () if name not in ("invalid", "others")]
+_RADAR_SCAN = ("range", "azimuth_rad", "elevation_rad", "doppler_velocity", "amplitude")
 _PACKET_BYTES, _RETURNS_AT, _COUNT_AT, _MAX_RETURNS = 35336, 101, 35309, 800
 _NOT_MEASURED = -1.0  # a variance of sensor_msgs/Imu that marks a missing measurement
 
@@ -129,16 +130,14 @@ def _point_cloud2(message: Any) -> Columns:
 
 def _point_cloud(message: Any) -> Columns:
     channels = {c.name: c.values for c in message.channels[::-1] if len(c.values) == len(message.points)}
-    return channels | {axis: _column(message.points, axis) for axis in "xyz"}
+    return channels | _columns("xyz", message.points)
 
 
-def _radar_scan(message: Any) -> Columns:
-    names = ("range", "azimuth_rad", "elevation_rad", "doppler_velocity", "amplitude")
-    return {name: _column(message.returns, name.removesuffix("_rad")) for name in names}
-
-
-def _column(rows: list[Any], attribute: str) -> Floats32:
-    return np.array([getattr(row, attribute) for row in rows], np.float32)
+def _columns(names: Iterable[str], rows: list[Any]) -> Columns:
+    """Columns of the attributes of rows. The name of an angle ends in its unit, which that of its attribute lacks."""
+    return {
+        name: np.array([getattr(r, name.removesuffix("_rad")) for r in rows], np.float32) for name in names
+    }
 
 
 def _ars548_packets(message: Any) -> Columns:
@@ -160,8 +159,7 @@ def _ars548_list(message: Any) -> Columns:
     flags = np.array([row.invalid for row in returns], np.uint8)
     if flags.ndim == 1:
         flags = np.unpackbits(flags[:, None], axis=1, bitorder="little")
-    columns = {name: _column(returns, name.removesuffix("_rad")) for name in _ARS548_VALUES}
-    return _ars548(columns, flags.T != 0)
+    return _ars548(_columns(_ARS548_VALUES, returns), flags.T != 0)
 
 
 def _ars548(returns: Columns, invalid: Bools) -> Columns:
@@ -197,7 +195,7 @@ IMU = "sensor_msgs/msg/Imu"
 _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
     "sensor_msgs/msg/PointCloud": _point_cloud,
-    "radar_msgs/msg/RadarScan": _radar_scan,
+    "radar_msgs/msg/RadarScan": lambda message: _columns(_RADAR_SCAN, message.returns),
     "continental_msgs/msg/ContinentalArs548DetectionList": _ars548_list,
     "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _ars548_packets,
@@ -225,7 +223,6 @@ def is_bag(path: Path) -> bool:
 
 
 def topics_of(paths: list[Path]) -> dict[str, Topic]:
-    """Topics of bags, by name."""
     topics: dict[str, Topic] = {}
     for path in paths:
         with _opened(path) as reader:
