@@ -1,11 +1,11 @@
 """``radarsdf live``: replay a recording as if its scans arrived now, or map running ROS 2 topics."""
 
-import contextlib
 import threading
 import time
 from argparse import Namespace
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from tempfile import TemporaryDirectory
 
@@ -119,7 +119,7 @@ def live(given: Namespace, results: Results) -> None:
     if trajectory is not None:
         checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
     check_outputs([out, trajectory, given.mcap, given.rrd], inputs_of(given))
-    with contextlib.ExitStack() as servers, contextlib.ExitStack() as files:
+    with ExitStack() as servers, ExitStack() as files:
         sinks, urls = _opened_sinks(given, servers, files)
         begin = given.map
         changed = begin and (given.config or given.set or given.paper)
@@ -139,7 +139,7 @@ def live(given: Namespace, results: Results) -> None:
             folder = servers.enter_context(temporary)
         with deferred_interrupts() as stopped:
             if request is not None:
-                node = servers.enter_context(contextlib.closing(Node(given.ros2_domain, given.host)))
+                node = servers.enter_context(closing(Node(given.ros2_domain, given.host)))
                 scans = Subscription(node, given.ros2, request, given.find, stopped, warn)
                 sinks, unposed = [*sinks, Ros2Sink(node, scans)], scans.unposed
                 results.add(
@@ -172,9 +172,7 @@ def live(given: Namespace, results: Results) -> None:
             until_stopped(wait)
 
 
-def _opened_sinks(
-    given: Namespace, servers: contextlib.ExitStack, files: contextlib.ExitStack
-) -> tuple[list[Sink], list[str]]:
+def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> tuple[list[Sink], list[str]]:
     """Sinks of the options, and the addresses of those that serve."""
     sinks: list[Sink] = []
     urls: list[str] = []
@@ -195,9 +193,9 @@ class _Shown:
     """Callback after each scan that passes it to all sinks, and periodically the surface and free space, in its own thread."""
 
     def __init__(
-        self, live_map: LiveMap, T_body_sensor: Mapping[Label, Floats] | None, sinks: list[Sink]
+        self, live_map: LiveMap, mountings: Mapping[Label, Floats] | None, sinks: list[Sink]
     ) -> None:
-        self._map, self._mountings, self._sinks = live_map, T_body_sensor, sinks
+        self._map, self._mountings, self._sinks = live_map, mountings, sinks
         self._path: dict[ScanId, Floats] = {}  # positions of every n-th scan
         self._every, self._scans, self._time_s = 1, 0, 0.0
         self._thread, self._lock = threading.Thread(), threading.Lock()

@@ -37,25 +37,20 @@ def _setting_of(text: str) -> dict[str, Any]:
     return {group: {name: read}} if dot else {path: read}
 
 
-def versions() -> dict[str, str]:
-    """Version, compiler, instruction set and threads of each component."""
+def info(given: Namespace, results: Results) -> None:
     import torch
 
     from radarsdf import _core
 
     openmp = _core.openmp_version()
-    return {
+    rows: dict[str, Any] = {
         "radarsdf": _core.__version__,
         "python": f"{platform.python_version()} on {platform.platform()}",
         "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
         "compiler": _core.compiler(),
         "openmp": f"{openmp}, {_core.num_threads()} threads" if openmp else "none: the core is serial",
-        "instruction set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
+        "instruction_set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
     }
-
-
-def info(given: Namespace, results: Results) -> None:
-    rows: dict[str, Any] = {name.replace(" ", "_"): value for name, value in versions().items()}
     if given.map is not None:
         from radarsdf.cli.inputs import load_map
 

@@ -2,7 +2,6 @@
 
 import struct
 import zlib
-from os import PathLike
 from pathlib import Path
 from uuid import UUID
 
@@ -80,9 +79,7 @@ def _octree(keys: Ints, codes: Ints) -> tuple[int, bytes]:
     return size, np.concatenate(words)[order].astype("<u2").tobytes()
 
 
-def write_vdb(
-    path: str | PathLike[str], values: Floats32, known: Bools, origin: Floats, voxel_m: float
-) -> None:
+def write_vdb(path: Path, values: Floats32, known: Bools, origin: Floats, voxel_m: float) -> None:
     """Write values (X, Y, Z) of known voxels as an OpenVDB level set named `distance`; the largest value is the background."""
     scales = (voxel_m, voxel_m, 1 / voxel_m, 1 / voxel_m**2, 0.5 / voxel_m)
     # OpenVDB's voxels are points: the centres of ours.

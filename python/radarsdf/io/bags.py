@@ -7,7 +7,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -56,7 +56,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
     poses = request.poses
     in_bag = poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses)))
-    radars = _Radars.of(paths, scan_topics, frames, request, partly=in_bag)
+    radars = _Radars(paths, scan_topics, frames, request, partly=in_bag)
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, clocks[topic.name], request) for topic in scan_topics]
@@ -86,31 +86,29 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     return Scans.of_source(source, request.notes, imu=imu, mountings=partial(radars.mountings, find))
 
 
-@dataclass(frozen=True)
 class _Radars:
     """Radars of a bag, each with its own topic or frame."""
 
-    several: bool
-    one_topic: bool
-    body: str  # frame to which all are attached, or else the most frequent one of the scans
-    mounted: dict[str, Floats]  # T_body_sensor (4, 4) by frame; empty if they are unknown
-    frames: dict[str, str] = field(default_factory=dict)  # by label, of the scans read so far
-
-    @classmethod
-    def of(
-        cls, paths: list[Path], topics: list[Topic], frames: list[str], request: Request, *, partly: bool
-    ) -> "_Radars":
+    def __init__(
+        self, paths: list[Path], topics: list[Topic], frames: list[str], request: Request, *, partly: bool
+    ) -> None:
         """Find the mountings of several radars in TF; `partly`: even if others are unknown."""
-        if len(topics) == len(frames) == 1:
-            return cls(False, True, frames[0], {})
+        self.one_topic, self.several = len(topics) == 1, len(topics) > 1 or len(frames) > 1
+        self.body = frames[0]  # frame to which all are attached, or else the most frequent one of the scans
+        self.mounted: dict[str, Floats] = {}  # T_body_sensor (4, 4) by frame; empty if they are unknown
+        self.frames: dict[str, str] = {}  # by label, of the scans read so far
+        if not self.several:
+            return
         body, mounted = transforms_in(paths, request).mountings(frames)
         # A frame that topics share does not tell where their radars are.
-        if len(frames) < len(topics) or (len(mounted) < len(frames) and not partly):
-            body, mounted = frames[0], {}
-        listed = ", ".join(mounted or frames)
-        words = f"mountings: TF, {body} -> {listed}" if mounted else f"no mountings are known of {listed}"
-        request.notes.add(f"{words}: poses are those of {body if mounted else 'each radar'}")
-        return cls(True, len(topics) == 1, body, mounted)
+        if len(frames) >= len(topics) and (partly or len(mounted) == len(frames)):
+            self.body, self.mounted = body, mounted
+        listed = ", ".join(self.mounted or frames)
+        found = (
+            f"mountings: TF, {body} -> {listed}" if self.mounted else f"no mountings are known of {listed}"
+        )
+        of_radars = self.body if self.mounted else "each radar"
+        request.notes.add(f"{found}: poses are those of {of_radars}")
 
     def labelled(self, raw: RawScan) -> RawScan:
         """Label a scan of several radars by its topic or, of one topic, by its frame."""

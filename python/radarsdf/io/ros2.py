@@ -253,7 +253,7 @@ class Subscription:
         return before and not self._assumed
 
     def _is_assumed(self) -> bool:
-        tree, topic = self._known().tree, self._known().topic
+        tree, topic, *_ = self._known()
         if topic is None or self._request.extrinsic is not None or not self._frames:
             return False
         sensor = next(iter(self._frames.values()))
@@ -363,7 +363,6 @@ class Subscription:
         return "" if late or attached else "static transforms of the radars"
 
     def _listen(self) -> None:
-        """Subscribe to topics once they are there, and receive their messages."""
         next_s = 0.0
         try:
             while not self._stopped():
