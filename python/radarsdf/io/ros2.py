@@ -112,25 +112,12 @@ def _qos(depth: int, *, reliable: bool, latched: bool) -> Any:
     )
 
 
-class _Encoded:
-    """A message that rosbags encodes and decodes, as those in bags: cyclonedds passes its bytes."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data = data
-
-    def serialize(self, **_: Any) -> bytes:
-        return self.data
-
-    @classmethod
-    def deserialize(cls, data: bytes, **_: Any) -> "_Encoded":
-        return cls(data)
-
-    deserialize_key = deserialize
-
-
 @cache
 def _dds_type(message_type: str) -> Any:
-    """Type for cyclonedds of messages of rosbags, with fields and names as those of ROS 2, by which peers match."""
+    """Type for cyclonedds of messages of rosbags, with fields and names as those of ROS 2, by which peers match.
+
+    Its instances hold the bytes of a message, which rosbags encodes and decodes, as those in bags.
+    """
     from cyclonedds import idl  # noqa: PLC0415 - an extra
 
     types: Any = idl.types
@@ -146,10 +133,11 @@ def _dds_type(message_type: str) -> Any:
 
     package, _, name = message_type.split("/")
     fields = {field: hint(*of) for field, of in message_types(cdr=True).fielddefs[message_type][1]}
-    made = idl.make_idl_struct(f"{name}_", f"{package}::msg::dds_::{name}_", fields, dataclassify=False)
+    made: Any = idl.make_idl_struct(f"{name}_", f"{package}::msg::dds_::{name}_", fields, dataclassify=False)
     # A base class would be part of the type.
-    for method in ("__init__", "serialize", "deserialize", "deserialize_key"):
-        setattr(made, method, vars(_Encoded)[method])
+    made.__init__ = lambda message, data: message.__dict__.update(data=data)
+    made.serialize = lambda message, **_: message.data
+    made.deserialize = made.deserialize_key = classmethod(lambda of, data, **_: of(data))
     return made
 
 
