@@ -221,11 +221,11 @@ class Grid:
             mask = np.pad(others, 1, constant_values=not beyond)
             return distance_transform_edt(mask, self.voxel_size)[1:-1, 1:-1, 1:-1].astype(np.float32)
 
-        stamped = _checked_obstacles(obstacles)
+        stamped, size = _checked_obstacles(obstacles), self.voxel_size
         points, normals = self._surface()
         state, rows = self.state.copy(), np.full(self.shape, -1)
         rows[self.occupied] = np.arange(len(points))
-        corners = np.floor((stamped - self.origin) / self.voxel_size).clip(-1, self.shape).astype(np.int64)
+        corners = np.floor((stamped - self.origin) / size).clip(-1, self.shape).astype(np.int64)
         for k, (first, last) in enumerate(corners):
             touched = tuple(map(slice, first.clip(0), last + 1))
             state[touched], rows[touched] = OCCUPIED, len(points) + k
@@ -234,16 +234,14 @@ class Grid:
         occupied, free = state == OCCUPIED, state == FREE
         occupied_m, surface_m = np.full((2, *self.shape), np.inf, np.float32)
         if occupied.any():
-            away_m, nearest = distance_transform_edt(~occupied, self.voxel_size, return_indices=True)
+            away_m, nearest = distance_transform_edt(~occupied, size, return_indices=True)
             occupied_m = np.where(occupied, -to_nearest(occupied, True), away_m.astype(np.float32))
             nearest, centres = rows[tuple(nearest)], self.centres().reshape(*self.shape, 3)
             for x, columns in enumerate(centres):  # memory
-                surface_m[x] = _distances_to_boxes(
-                    columns, boxes, normals, nearest[x], free[x], self.voxel_size
-                )
-        error_m = math.sqrt(3) / 2 * self.voxel_size + self.position_error_m
+                surface_m[x] = _distances_to_boxes(columns, boxes, normals, nearest[x], free[x], size)
+        error_m = math.sqrt(3) / 2 * size + self.position_error_m
         of_space = state != UNKNOWN, occupied_m, to_nearest(free, True), surface_m
-        return DistanceField(self.origin, self.voxel_size, *of_space, error_m)
+        return DistanceField(self.origin, size, *of_space, error_m)
 
     def _surface(self) -> tuple[Floats, Floats]:
         """Return points (N, 3), world, m, on the surface in the occupied voxels, and its unit normals, 0 where unknown."""
@@ -359,15 +357,10 @@ class Grid:
         return height, np.where(found, room, np.nan).astype(np.float32)
 
 
-def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | DistanceField) -> None:
-    """Write costs or distances of a grid to an ``.npz``, by name, with its `origin` and `voxel_size`.
-
-    Distances to the surface, in known voxels, also to a ``.vdb``, a level set of OpenVDB.
-    """
-    suffixes = DISTANCE_SUFFIXES if isinstance(found, DistanceField) else (".npz",)
-    if checked_suffix(path, suffixes, "arrays of a grid") == ".vdb":
-        assert isinstance(found, DistanceField)
-        write_vdb(Path(path), found.surface_m, found.known, found.origin, found.voxel_size)
+def save_arrays(path: Path, grid: Grid, found: Costmap | DistanceField) -> None:
+    """Write costs or distances, with the grid's `origin` and `voxel_size`, to an ``.npz``; distances also to a ``.vdb``."""
+    if path.suffix.lower() == ".vdb" and isinstance(found, DistanceField):
+        write_vdb(path, found.surface_m, found.known, found.origin, found.voxel_size)
         return
     arrays = {name: values for name, values in vars(found).items() if not name.startswith("_")}
     write_arrays(path, {"origin": grid.origin, "voxel_size": grid.voxel_size, **arrays}, compressed=True)

@@ -95,18 +95,16 @@ def read_scans(path: AnyPath) -> Scans:
 
 
 def _check_scans(arrays: Mapping[str, Array]) -> None:
-    labels = arrays.get("sensor_labels", np.zeros(0))
-    known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1], "K": labels.shape[:1]}
+    of_lengths = {"N": "points", "F": "poses", "K": "sensor_labels"}
+    known = {length: np.shape(arrays.get(name, ()))[:1] for length, name in of_lengths.items()}
     for name, array in arrays.items():
         kinds = {"static": "biuf", "sensor_labels": "U"}.get(name, "iuf")
         check(array.dtype.kind in kinds, f"{name} must be real numbers, not {array.dtype}")
         first, *rest = _SHAPES.get(name, (None, *array.shape[1:]))
         expected = (*known.get(str(first), array.shape[:1]), *rest)
         check(array.shape == expected, f"{name} must have shape {expected}, not {array.shape}")
-    for name, of, count in (
-        ("frame", "poses", len(arrays["poses"])),
-        ("sensor", "sensor_labels", len(labels)),
-    ):
+    for name, of in (("frame", "poses"), ("sensor", "sensor_labels")):
+        count = len(arrays.get(of, ()))
         rows = arrays.get(name, np.zeros(count))
         fits = (rows == np.floor(rows)) & (rows >= 0) & (rows < count)
         check(fits.all(), f"{name} must hold row indices of the {count} {of}")
