@@ -235,7 +235,7 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     for other in sorted(fitting - {name}):
         notes.add(f"poses of {other} are ignored; pose_topic selects them")
     check(find or name in tracks, f"{paths[0]}: {name} holds no poses")
-    return find or topic_poses(name, tracks, tree, sensor, request)
+    return find or topic_poses(name, tracks[name], tree, sensor, request)
 
 
 def _tracks_in(paths: list[Path], topics: set[str], request: Request) -> Tracks:
@@ -255,17 +255,15 @@ def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferre
     return leading[0] if len(leading) == 1 else ""
 
 
-def topic_poses(
-    name: str, tracks: Mapping[str, Track], tree: TransformTree, sensor: str, request: Request
-) -> FindPoses:
+def topic_poses(name: str, track: Track, tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of a topic: of the frame that it names, or else of the one that moves with the sensor."""
     notes = request.notes
     request.refuse(f"the poses are those of {name}, and not of TF", "world_frame")
-    trajectory = tracks[name].trajectory(name, request)
+    trajectory = track.trajectory(name, request)
     notes.add(f"poses: {len(trajectory.times_s)} of {name}")
     if request.extrinsic is not None:
         return tree.attach(trajectory, sensor, request)
-    child = tracks[name].child
+    child = track.child
     base = child or tree.mounted_on(sensor)
     if tree.mounted_on(base) != tree.mounted_on(sensor) or (not child and base == sensor):
         notes.add(

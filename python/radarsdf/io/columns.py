@@ -291,7 +291,7 @@ class Fields:
         degrees = (self.in_degrees and dimension == "angle") or _squeeze(bare) in _IN_DEGREES
         return factor_of("deg" if degrees and not unit else unit, dimension, name)
 
-    def with_unit(self, columns: Mapping[str, Array], notes: Notes) -> "Fields":
+    def with_unit(self, columns: Columns, notes: Notes) -> "Fields":
         """Return these fields with the unit of their angles, from their names or else from the values in a cloud."""
         names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
         if all(plain_name(name)[1] for name in names):
@@ -310,9 +310,7 @@ class Fields:
         if unused := [name for name in names if name and name not in self.names.values()]:
             notes.add(f"unused fields: {', '.join(unused)}; fields={{role: name}} or --field selects others")
 
-    def scan(
-        self, columns: Mapping[str, Array], T_world_sensor: Floats, time_s: float | None, notes: Notes
-    ) -> Scan:
+    def scan(self, columns: Columns, T_world_sensor: Floats, time_s: float | None, notes: Notes) -> Scan:
         """Build a scan of the finite returns in the columns, (N,) each. Positions are float64 if x, y or z need it, else float32."""
         values: dict[str, Array] = {}  # m, rad, m/s
         of_sigma = SIGMA if set(SIGMA) <= set(self.names) else ()

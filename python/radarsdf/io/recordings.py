@@ -100,15 +100,13 @@ class RawScan:
     sensor: Label | None = None  # label of its radar, if there are several
 
 
-def posed(
-    raw_scans: Callable[[], Iterable[RawScan]], find_poses: FindPoses, request: Request
-) -> Iterator[Scan]:
+def posed(raw_scans: Callable[[], Iterable[RawScan]], find: FindPoses, request: Request) -> Iterator[Scan]:
     """Yield scans with poses and at least one return, in the order of the files, for :meth:`Scans.of_source`."""
     notes = request.notes
-    layouts: dict[tuple[str, ...], Fields] = {}
+    layouts: dict[Any, Fields] = {}
     num_posed, unposed = 0, ""
     for number, raw in enumerate(raw_scans()):
-        known = find_poses(raw.frame)
+        known = find(raw.frame)
         if known is None:
             notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}")
             continue
@@ -131,9 +129,7 @@ def posed(
     check(num_posed or not unposed, f"{notes.about}: {what}")
 
 
-def _scan(
-    raw: RawScan, T_world_sensor: Floats, layouts: dict[tuple[str, ...], Fields], request: Request
-) -> Scan | None:
+def _scan(raw: RawScan, T_world_sensor: Floats, layouts: dict[Any, Fields], request: Request) -> Scan | None:
     """Read a scan; None, and counted, if it is damaged or empty. `layouts`: roles of the columns by topic and names so far."""
     notes, scan = request.notes, None
     try:

@@ -297,7 +297,7 @@ class Subscription:
                 find = tree_poses(tree, sensor, request)
             else:
                 check(name in topics, f"{name} has no messages yet")
-                find = topic_poses(name, topics, tree, sensor, request)
+                find = topic_poses(name, topics[name], tree, sensor, request)
         except ValueError as why:
             error = why
         return _Known(tree, topics.get(name or ""), find, error, request.notes.lines)
