@@ -174,19 +174,17 @@ def live(given: Namespace, results: Results) -> None:
 
 def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> tuple[list[Sink], list[str]]:
     """Sinks of the options, and the addresses of those that serve."""
-    sinks: list[Sink] = []
-    urls: list[str] = []
+    opened: list[tuple[Sink, str]] = []
     if given.view:
         page = servers.enter_context(GrowingView(host=given.host, port=given.port))
-        sinks, urls = [page], [url_of(page.host, page.port)]
+        opened.append((page, url_of(page.host, page.port)))
     of_viewers = (foxglove_sink, given.foxglove, given.mcap), (rerun_sink, given.rerun, given.rrd)
     for open_sink, served, path in of_viewers:
         if served:
-            sink, url = servers.enter_context(open_sink(None))
-            sinks, urls = [*sinks, sink], [*urls, url]
+            opened.append(servers.enter_context(open_sink(None)))
         if path is not None:
-            sinks.append(files.enter_context(open_sink(path))[0])
-    return sinks, urls
+            opened.append(files.enter_context(open_sink(path)))
+    return [sink for sink, _ in opened], [url for _, url in opened if url]
 
 
 class _Shown:

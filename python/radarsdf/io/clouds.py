@@ -48,12 +48,10 @@ def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
     check(suffix in READERS, f"{path} is not a point cloud file: those end in {', '.join(CLOUD_SUFFIXES)}")
     try:
         return READERS[suffix](path, columns)
-    except (ImportError, MemoryError):
-        raise
     except BaseException as error:  # damaged files raise many kinds, including OSError
-        if isinstance(error, OSError) and error.filename is not None:
-            raise
-        if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
+        of_system = isinstance(error, OSError) and error.filename is not None
+        of_data = isinstance(error, Exception) or type(error).__name__ == _PANIC
+        if of_system or not of_data or isinstance(error, (ImportError, MemoryError)):
             raise
         msg = f"{path} is not a complete {suffix} file of points: {error}"
         raise ValueError(msg) from error
