@@ -249,18 +249,15 @@ def _coloradar(folder: Path, request: Request) -> Scans:
     return read_files(sorted(files, key=natural), folder, replace(request, columns=request.columns or 5))
 
 
-def _delft_radar(folder: Path) -> Path:
-    inner = "training" if (folder / "training/velodyne").is_dir() else "radar/training"
-    return folder.resolve() / inner
-
-
-def _delft_lidar(folder: Path) -> Path:
-    return _delft_radar(folder).parents[1] / "lidar/training"
+def _delft_folders(folder: Path) -> tuple[Path, Path]:
+    """Folders of the radar and of the lidar."""
+    radar = folder.resolve() / ("training" if (folder / "training/velodyne").is_dir() else "radar/training")
+    return radar, radar.parents[1] / "lidar/training"
 
 
 def _view_of_delft(folder: Path, request: Request) -> Scans:
     """Read View-of-Delft, complete or only its radar folder: a calibration and a pose for each frame."""
-    radar, lidar = _delft_radar(folder), _delft_lidar(folder)
+    radar, lidar = _delft_folders(folder)
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
@@ -315,7 +312,7 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
 # The first one that fits a folder is used.
 DATASETS = (
     Dataset("SNAIL-Radar", lambda f: any((f / radar).is_dir() for radar in _SNAIL_RADARS), _snail_radar),
-    Dataset("View-of-Delft", lambda f: (_delft_lidar(f) / "pose").is_dir(), _view_of_delft),
+    Dataset("View-of-Delft", lambda f: (_delft_folders(f)[1] / "pose").is_dir(), _view_of_delft),
     Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
     Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
 )
