@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from radarsdf._core import cell_keys
 from radarsdf.evaluation import surface_metrics
 from radarsdf.simulate import Scene as World
-from radarsdf.simulate.radar import Lidar, generator, unit_vectors
+from radarsdf.simulate import Simulation
+from radarsdf.simulate.radar import generator, unit_vectors
 from scipy.spatial import cKDTree
 
 from scenes.scene import Scene
@@ -132,25 +133,25 @@ def _flat_piece(lidar: FloatArray, rows: list[int], radius_m: float) -> tuple[Fl
 
 
 @lru_cache(maxsize=1)
-def filled_truth(lidar: Lidar) -> FloatArray:
+def filled_truth(simulation: Simulation) -> FloatArray:
     """Points (M, 3), world, m, one per cell of 0.1 m, of all surface that the radar typically detects.
 
-    The lidar's own points leave holes where its rays are sparse. Here, as many rays follow each ray of a grid as there are
-    cells in the surface that it stands for.
+    The ground truth of a simulation has holes where the rays of its lidar are sparse. Here, as many rays follow each ray of
+    a grid as there are cells in the surface that it stands for.
     """
-    rng, sensor, found = generator(lidar.seed, _STREAM), lidar.sensor, np.zeros((0, 3))
+    rng, sensor, found = generator(simulation.seed, _STREAM), simulation.sensor, np.zeros((0, 3))
     half = np.array([sensor.azimuth_fov_rad / 2, np.sin(sensor.elevation_fov_rad / 2)])
     columns = max(1, round(np.sqrt(_FIRST_RAYS * half[0] / half[1])))
     lines = -(-_FIRST_RAYS // columns)
     shape, grid = np.array([columns, lines]), np.indices((columns, lines)).reshape(2, -1).T
-    for T_world_sensor in lidar.poses[:: max(1, len(lidar.poses) // 40)]:
+    for T_world_sensor in simulation.lidar_poses[:: max(1, len(simulation.lidar_poses) // 40)]:
         rays, before, origin = grid, cell_keys(found, _FILLED_CELL_M), T_world_sensor[:3, 3]
         for is_last in (False, True):
             u = half * (2 * (rays + rng.random(rays.shape)) / shape - 1)
             angles = np.stack([u[:, 0], np.arcsin(u[:, 1])], axis=1)
             directions = unit_vectors(angles) @ T_world_sensor[:3, :3].T
-            hits = lidar.scene.raycast(origin, directions, sensor.max_range_m)
-            detected = sensor.echo_power_db(lidar.scene, origin, directions, hits) >= sensor.threshold_db
+            hits = simulation.scene.raycast(origin, directions, sensor.max_range_m)
+            detected = sensor.echo_power_db(simulation.scene, origin, directions, hits) >= sensor.threshold_db
             rows = np.flatnonzero(detected & (hits.range_m >= sensor.min_range_m))
             points = origin + hits.range_m[rows, None] * directions[rows]
             new = ~np.isin(cell_keys(points, _FILLED_CELL_M), before)
@@ -164,8 +165,8 @@ def filled_truth(lidar: Lidar) -> FloatArray:
     return found
 
 
-def score_without_holes(lidar: Lidar, mesh: trimesh.Trimesh, x: FloatArray, samples: int) -> float:
+def score_without_holes(simulation: Simulation, mesh: trimesh.Trimesh, x: FloatArray, samples: int) -> float:
     """F-score with nothing discarded: precision of points `x` (N, 3) by the scene, completeness by :func:`filled_truth`."""
-    precision = float(np.mean(np.abs(lidar.scene.signed_distance(x)) <= NEAR_M))
-    completion: float = surface_metrics(mesh, filled_truth(lidar), samples=samples)["completion_ratio"]
+    precision = float(np.mean(np.abs(simulation.scene.signed_distance(x)) <= NEAR_M))
+    completion: float = surface_metrics(mesh, filled_truth(simulation), samples=samples)["completion_ratio"]
     return 2 * precision * completion / max(precision + completion, 1e-9)

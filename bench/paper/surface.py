@@ -89,8 +89,8 @@ def measured(options: argparse.Namespace, peer: Peer, scene: Scene, held_out: Sc
         return row | {"why_not": str(error)}
     if scene.simulation is not None and scene.box is None:
         x = sampled(result.mesh, samples_of(options, _MOST_EXACT), None)[0]
-        lidar, samples = scene.simulation.lidar, samples_of(options)
-        metrics["f_score_without_holes"] = score_without_holes(lidar, result.mesh, x, samples)
+        without_holes = score_without_holes(scene.simulation, result.mesh, x, samples_of(options))
+        metrics["f_score_without_holes"] = without_holes
     return row | {"triangles": len(result.mesh.faces), **metrics}
 
 

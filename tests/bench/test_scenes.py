@@ -140,19 +140,20 @@ def test_points_beyond_an_edge_have_no_error():
 
 
 def test_the_filled_truth_has_no_holes_on_detectable_surface(wall):
-    lidar = wall.simulation.lidar
-    truth = filled_truth(lidar)
-    assert np.abs(lidar.scene.signed_distance(truth)).max() < 1e-3
+    simulation = wall.simulation
+    truth = filled_truth(simulation)
+    assert np.abs(simulation.scene.signed_distance(truth)).max() < 1e-3
     assert len(np.unique(np.floor(truth / 0.1), axis=0)) == len(truth)
-    rng, T = np.random.default_rng(0), lidar.poses[3]
+    rng, T = np.random.default_rng(0), simulation.lidar_poses[3]
     angles = rng.uniform(-0.5, 0.5, (3000, 2)) * [
-        lidar.sensor.azimuth_fov_rad,
-        lidar.sensor.elevation_fov_rad,
+        simulation.sensor.azimuth_fov_rad,
+        simulation.sensor.elevation_fov_rad,
     ]
     directions = unit_vectors(angles) @ T[:3, :3].T
-    hits = lidar.scene.raycast(T[:3, 3], directions, lidar.sensor.max_range_m)
+    hits = simulation.scene.raycast(T[:3, 3], directions, simulation.sensor.max_range_m)
     detected = (
-        lidar.sensor.echo_power_db(lidar.scene, T[:3, 3], directions, hits) >= lidar.sensor.threshold_db
+        simulation.sensor.echo_power_db(simulation.scene, T[:3, 3], directions, hits)
+        >= simulation.sensor.threshold_db
     )
     found = T[:3, 3] + hits.range_m[detected, None] * directions[detected]
     assert len(found) > 300
@@ -160,11 +161,11 @@ def test_the_filled_truth_has_no_holes_on_detectable_surface(wall):
 
 
 def test_the_score_without_holes_is_of_the_scene_and_the_filled_truth(wall):
-    lidar = wall.simulation.lidar
-    truth = filled_truth(lidar)
+    simulation = wall.simulation
+    truth = filled_truth(simulation)
     corners = truth[:, None] + 0.01 * np.eye(3)
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(truth)).reshape(-1, 3), process=False)
     x = np.concatenate([truth, truth[::3] + [0, 0, 50.0]])  # a quarter is in the sky
-    assert score_without_holes(lidar, mesh, x, 300_000) == pytest.approx(2 * 0.75 / 1.75, abs=1e-3)
+    assert score_without_holes(simulation, mesh, x, 300_000) == pytest.approx(2 * 0.75 / 1.75, abs=1e-3)
     far = trimesh.Trimesh(mesh.vertices + [0, 0, 50.0], mesh.faces, process=False)
-    assert score_without_holes(lidar, far, x, 300_000) == 0
+    assert score_without_holes(simulation, far, x, 300_000) == 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from radarsdf.arrays import Floats, Floats32
 from radarsdf.checks import check, check_poses, positive, real_array
-from radarsdf.poses.rigid import moved, steps
+from radarsdf.poses.rigid import assembled, steps, transform
 from radarsdf.rig import Imu, Label, Rig, checked_rotation
 from radarsdf.scans import Scans
 
@@ -212,11 +213,8 @@ def drifted(poses: Floats, sigma_m: float, sigma_rad: float, seed: int = 0, yaw_
     rng = np.random.default_rng(seed)
     errors = rng.normal(0, 1, (len(poses) - 1, 6)) * np.repeat([sigma_m, sigma_rad], 3)
     errors[:, 5] += yaw_rad
-    wrong = moved(np.tile(np.eye(4), (len(errors), 1, 1)), errors)
-    found = [poses[0]]
-    for step, error in zip(steps(poses), wrong, strict=True):
-        found.append(found[-1] @ step @ error)
-    return np.stack(found)
+    pairs = zip(steps(poses), transform(errors[:, 3:], errors[:, :3]), strict=True)
+    return np.stack([*accumulate(pairs, lambda T, pair: T @ pair[0] @ pair[1], initial=poses[0])])
 
 
 _RIG_STREAM = 2**31 + 4  # no scan has this index
@@ -298,8 +296,7 @@ def simulate_rig(
     rig = Rig.of(labels, mounted)
     assert rig is not None
     true_s = np.concatenate(times)
-    body = np.tile(np.eye(4), (len(true_s), 1, 1))
-    body[:, :3, :3], body[:, :3, 3] = turning(true_s).as_matrix(), positions(true_s)
+    body = assembled(turning(true_s).as_matrix(), positions(true_s))
     # SciPy's rates are in the frame of the rotating body.
     velocities = np.einsum("fji,fj->fi", body[:, :3, :3], positions(true_s, 1))
     velocities += np.cross(turning(true_s, 1), rig.mountings[:, :3, 3])
@@ -317,8 +314,7 @@ def simulate_rig(
     of_radars: dict[str, Any] = {"sensors": labels, "T_body_sensor": mounted}
     scans = Scans(points, body, values, doppler_mps=doppler_mps, times_s=stamps_s, **of_radars)
     scans = scans.select(np.argsort(stamps_s, kind="stable"))
-    lidars = [simulation.lidar for simulation in simulations.values()]
-    truth = scans.with_ground_truth(lambda: np.concatenate([lidar.points for lidar in lidars]))
+    truth = scans.with_ground_truth(lambda: np.concatenate([own.ground_truth for own in each]))
     return SimulatedRig(truth, simulations)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,17 +162,19 @@ class RadarSensor:
         echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
         return self.gain_db + echo - self.range_loss_db * np.log10(range_m)
 
+    def angles(self, u: Floats) -> Floats:
+        """Azimuths and elevations (N, 2), rad, uniform in azimuth and in the sine of elevation for `u` (N, 2) uniform in 0..1."""
+        azimuth = (u[:, 0] - 0.5) * self.azimuth_fov_rad
+        elevation = np.arcsin((2 * u[:, 1] - 1) * np.sin(self.elevation_fov_rad / 2))
+        return np.stack([azimuth, elevation], axis=1)
+
     def _beam_angles(self, rng: np.random.Generator) -> Floats:
-        """Azimuth and elevation (beams, 2), rad: a jittered grid, uniform in azimuth and in the sine of elevation."""
         aspect = self.azimuth_fov_rad / self.elevation_fov_rad
         columns = max(1, round(min(self.beams, np.sqrt(self.beams * aspect))))
         rows = -(-self.beams // columns)
         cell = rng.permutation(rows * columns)[: self.beams]
         u = np.stack([cell % columns, cell // columns], axis=1) + rng.random((self.beams, 2))
-        u /= [columns, rows]
-        azimuth = (u[:, 0] - 0.5) * self.azimuth_fov_rad
-        elevation = np.arcsin((2 * u[:, 1] - 1) * np.sin(self.elevation_fov_rad / 2))
-        return np.stack([azimuth, elevation], axis=1)
+        return self.angles(u / [columns, rows])  # a jittered grid
 
     def _surface(self, scene: Scene, rays: _Rays, rng: np.random.Generator) -> _Echoes:
         hits = rays.hits
@@ -294,37 +296,6 @@ _LIDAR_STREAM = 2**31  # no scan has this index
 
 
 @dataclass(frozen=True, eq=False)
-class Lidar:
-    """A lidar at some of the radar's poses with its field of view and range, which sees the surfaces detectable by radar."""
-
-    scene: Scene
-    sensor: RadarSensor
-    poses: Floats  # (F, 4, 4) T_world_sensor, m
-    seed: int
-
-    @cached_property
-    def points(self) -> Floats:
-        """(M, 3) world, m, computed on first access: ray casting takes as long as the scans."""
-        rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
-        found = [np.zeros((0, 3))]
-        every = max(1, len(self.poses) // 40)  # neighbouring poses see the same surfaces
-        for T_world_sensor in self.poses[::every]:
-            u = rng.uniform(-1, 1, size=(_LIDAR_RAYS, 2))
-            elevation = np.arcsin(u[:, 1] * np.sin(sensor.elevation_fov_rad / 2))
-            angles = np.stack([u[:, 0] * sensor.azimuth_fov_rad / 2, elevation], axis=1)
-            directions, origin = unit_vectors(angles) @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
-            hits = self.scene.raycast(origin, directions, sensor.max_range_m)
-            visible = sensor.echo_power_db(self.scene, origin, directions, hits) >= sensor.threshold_db
-            visible &= hits.range_m >= sensor.min_range_m
-            range_m = hits.range_m[visible] + _LIDAR_SIGMA_M * rng.standard_normal(int(visible.sum()))
-            found.append(origin + range_m[:, None] * directions[visible])
-        points = np.concatenate(found)
-        cells = np.floor(points / _LIDAR_CELL_M).astype(np.int64)
-        _, first = np.unique(cells, axis=0, return_index=True)
-        return points[np.sort(first)]
-
-
-@dataclass(frozen=True, eq=False)
 class Simulation:
     """Simulated radar scans with poses and ground truth.
 
@@ -340,15 +311,30 @@ class Simulation:
     sensor: RadarSensor
     name: str
     seed: int
-    lidar: Lidar
+    lidar_poses: Floats  # (G, 4, 4) T_world_sensor, m: at some of them, a lidar measures the ground truth
 
-    @property
+    @cached_property
     def ground_truth(self) -> Floats:
         """(M, 3) lidar points of the surfaces that the radar can detect, world frame, m.
 
-        They have a noise of 1 cm along the ray, and at most one point per cell of 5 cm.
+        They have a noise of 1 cm along the ray, and at most one point per cell of 5 cm. Computed on first access: it takes as
+        long as the scans.
         """
-        return self.lidar.points
+        rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
+        found = [np.zeros((0, 3))]
+        every = max(1, len(self.lidar_poses) // 40)  # neighbouring poses see the same surfaces
+        for T_world_sensor in self.lidar_poses[::every]:
+            angles = sensor.angles(rng.random((_LIDAR_RAYS, 2)))
+            directions, origin = unit_vectors(angles) @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
+            hits = self.scene.raycast(origin, directions, sensor.max_range_m)
+            visible = sensor.echo_power_db(self.scene, origin, directions, hits) >= sensor.threshold_db
+            visible &= hits.range_m >= sensor.min_range_m
+            range_m = hits.range_m[visible] + _LIDAR_SIGMA_M * rng.standard_normal(int(visible.sum()))
+            found.append(origin + range_m[:, None] * directions[visible])
+        points = np.concatenate(found)
+        cells = np.floor(points / _LIDAR_CELL_M).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        return points[np.sort(first)]
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -402,6 +388,6 @@ def simulate(scene: Scene, sensor: RadarSensor, poses: Floats, *, name: str, see
     instance(sensor, RadarSensor, "sensor")
     poses = check_poses(poses)
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
-    of_scans = {column: [getattr(scan, column) for scan in scans] for column in SimulatedScan._fields}
-    lidar = Lidar(scene, sensor, poses.copy(), seed)
-    return Simulation(poses=poses, scene=scene, sensor=sensor, name=name, seed=seed, lidar=lidar, **of_scans)
+    values: dict[str, Any] = {of: [getattr(scan, of) for scan in scans] for of in SimulatedScan._fields}
+    values |= {"scene": scene, "sensor": sensor, "lidar_poses": poses.copy()}
+    return Simulation(poses=poses, name=name, seed=seed, **values)

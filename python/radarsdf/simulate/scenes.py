@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import whole_number
+from radarsdf.poses.rigid import assembled
 
 from . import materials
 from .materials import Material
@@ -153,12 +154,9 @@ def along_path(
     # Two sines of different frequency for each of heave, pitch and roll, so that the motion does not repeat.
     cycles, phase = rng.uniform([3, 7], [6, 12], size=(3, 2)), rng.uniform(0, 2 * np.pi, size=(3, 2))
     swing = np.sin(2 * np.pi * u[:, None, None] * cycles + phase).mean(axis=2) * [0.03, 0.02, 0.02]
-    poses = np.tile(np.eye(4), (frames, 1, 1))
-    angles = np.stack([yaw, swing[:, 1], swing[:, 2]], axis=1)
-    poses[:, :3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
-    poses[:, :2, 3] = xy
-    poses[:, 2, 3] = terrain.height(xy) + height_m + swing[:, 0]
-    return poses
+    rotations = Rotation.from_euler("ZYX", np.column_stack([yaw, swing[:, 1:]]))
+    heights = terrain.height(xy) + height_m + swing[:, 0]
+    return assembled(rotations.as_matrix(), np.column_stack([xy, heights]))
 
 
 _LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan uses

@@ -6,6 +6,7 @@ World frame: z up, m. Signed distances are positive in free space and negative i
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -337,10 +338,7 @@ class Scene:
         absolute value may be too small.
         """
         p = np.asarray(points, dtype=np.float64)
-        best = np.full(len(p), np.inf)
-        for part in self.parts:
-            np.minimum(best, part.signed_distance(p), out=best)
-        return best
+        return reduce(np.minimum, (part.signed_distance(p) for part in self.parts), np.full(len(p), np.inf))
 
     def echo_db(self, points: Floats, directions: Floats, hits: Hits) -> Floats:
         """Echo (N,), dB, without the loss by range, of the hits of rays at points (N, 3); -inf without a hit."""
