@@ -101,7 +101,8 @@ def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map
     # The mesh has the colours for the last position of the drag, in the frame of the page.
     def difference(position):
         sensor = sharp_map.origin + position
-        colors = viewer.quantities["intensity"].colors(np.arange(len(viewer.surface.vertices)), sensor)
+        quantity, rows = viewer.quantities["intensity"], np.arange(len(viewer.surface.vertices))
+        colors = quantity.scale(quantity.values(rows, sensor))
         return np.abs(shaded(colors, viewer.surface.lightness) - mesh_of(new_mesh).colors).mean()
 
     assert difference([1.0, 0.0, 1.0]) < 2

@@ -10,7 +10,7 @@ from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
 from radarsdf.checks import AnyPath, check, real_array
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
-from radarsdf.render.figures import new_figure, png_of
+from radarsdf.render.figures import Scale, new_figure, png_of
 from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
@@ -149,13 +149,11 @@ def save_picture(
         values = real_array(scalar, "scalar")
         fits = values.shape == (len(mesh.vertices),)
         check(fits, f"scalar must be ({len(mesh.vertices)},), one value per vertex, not {values.shape}")
-        known = values[np.isfinite(values)]
-        lower, upper = map(float, np.percentile(known, [2, 98]) if known.size else (0.0, 1.0))
-        colors = intensity_colors(values, lower, upper)
-        image = render(mesh, colors, width=round(0.9 * width), height=height, viewpoint=viewpoint)
+        scale = Scale.of(values)
+        image = render(mesh, scale(values), width=round(0.9 * width), height=height, viewpoint=viewpoint)
         axes = figure.add_axes((0.92, 0.3, 0.012, 0.4))
         steps = intensity_colors(np.linspace(0, 1, 256), 0, 1) / 255.0
-        shades = ScalarMappable(Normalize(lower, upper), ListedColormap(steps))
+        shades = ScalarMappable(Normalize(scale.low, scale.high), ListedColormap(steps))
         bar = figure.colorbar(shades, cax=axes, extend="both")
         bar.set_label(label, size=13)
         bar.ax.tick_params(labelsize=12)

@@ -25,7 +25,7 @@ from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
-from radarsdf.render.figures import draw_trajectories, new_figure, png_of
+from radarsdf.render.figures import SHARES, Scale, draw_trajectories, new_figure, png_of
 from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.scans import Scans
@@ -33,7 +33,7 @@ from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import MEANING, centre_of
 from radarsdf.view.serving import aim, framing_pose, free_port, start_server, stop_server
-from radarsdf.view.surface import SHARES, Scale, glb, templates_of, thinned
+from radarsdf.view.surface import glb, templates_of, thinned
 
 MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
 _WIDTH, _HEIGHT = 1040, 650  # pixels

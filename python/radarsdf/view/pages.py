@@ -11,11 +11,12 @@ from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
 from radarsdf.checks import check
 from radarsdf.grids.grid import Grid
 from radarsdf.map.map import Map
+from radarsdf.render.figures import SHARES
 from radarsdf.scans import Scan, Scans
 from radarsdf.view.scene import SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_cloud, add_mesh, add_path
 from radarsdf.view.serving import CameraPose, Page, aim, framing_pose
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
-from radarsdf.view.surface import SHARES, ShownSurface, as_html, first_hit, quantities_of, thinned
+from radarsdf.view.surface import ShownSurface, as_html, first_hit, quantities_of, thinned
 
 _GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
 _MARK_SHARE = 0.012  # radius of a click's mark, as a share of its distance: of constant size on the screen

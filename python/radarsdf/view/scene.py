@@ -16,18 +16,10 @@ import numpy as np
 from radarsdf.arrays import Array, Bytes, Floats, Ints
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
+from radarsdf.render.figures import Scale
 from radarsdf.scans import Scans
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
-from radarsdf.view.surface import (
-    Position,
-    Quantity,
-    Scale,
-    ShownSurface,
-    glb,
-    lightness_of,
-    shaded,
-    spread_evenly,
-)
+from radarsdf.view.surface import Position, Quantity, ShownSurface, glb, lightness_of, shaded, spread_evenly
 
 # Measured returns without intensities; predictions are not on the intensity scale, and stand out from the surface.
 SCAN_COLORS = {"measured": (0, 72, 140), "predicted": (0, 158, 115), "trajectory": (40, 44, 52)}
@@ -186,8 +178,8 @@ class Canvas:
         self._shown(state)
 
     def _colors(self, rows: Ints, state: State) -> Bytes:
-        colors = self._quantities[state.quantity].colors(rows, state.sensor)
-        return shaded(colors, self._surface.lightness[rows])
+        quantity = self._quantities[state.quantity]
+        return shaded(quantity.scale(quantity.values(rows, state.sensor)), self._surface.lightness[rows])
 
 
 class ScanClouds:

@@ -14,9 +14,9 @@ from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check
 from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
-from radarsdf.map.colors import intensity_colors
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
+from radarsdf.render.figures import SHARES, Scale
 
 if TYPE_CHECKING:
     import trimesh
@@ -154,42 +154,11 @@ def light_to_show(colors: Bytes) -> Floats32:
 
 
 @dataclass(frozen=True)
-class Scale:
-    """A fixed scale of sRGB colours from `low` to `high`; NaN is grey."""
-
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: Array) -> "Scale":
-        """Build from the 2nd and the 98th percentile of values (N,)."""
-        known = values[np.isfinite(values)]
-        low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
-        return cls(float(low), float(high))
-
-    def __call__(self, values: Array) -> Bytes:
-        """(N, 3) sRGB of values (N,)."""
-        return intensity_colors(values, self.low, self.high)[:, :3]
-
-    @property
-    def css(self) -> str:
-        """The colours from low to high, as CSS."""
-        return ",".join(map(css_color, intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3].tolist()))
-
-
-SHARES = Scale(0.0, 1.0)
-
-
-@dataclass(frozen=True)
 class Quantity:
     label: str  # name and unit
     values: Callable[[Ints, Position], Array]  # (N,) of vertices (N,), for a sensor at a position
     scale: Scale
     of_sensor: bool = False  # whether it depends on the sensor position
-
-    def colors(self, rows: Ints, sensor: Position) -> Bytes:
-        """(N, 3) sRGB of vertices (N,)."""
-        return self.scale(self.values(rows, sensor))
 
 
 def quantities_of(radar_map: "Map", surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
@@ -209,7 +178,7 @@ def quantities_of(radar_map: "Map", surface: ShownSurface, sensor: Position) -> 
         "height": ("height, m", vertices[:, 2]),
     }
     for name, (label, values) in of_vertices.items():
-        scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
+        scale = SHARES if name == "confidence" else Scale.of(values)
         found[name] = Quantity(label, lambda rows, _, values=values: values[rows], scale)  # type: ignore[misc]
     return found
 
@@ -230,6 +199,7 @@ def templates_of(subpackage: str) -> jinja2.Environment:
     loader, extensions = jinja2.PackageLoader(f"radarsdf.{subpackage}"), ["jinja2.ext.do"]
     environment = jinja2.Environment(loader=loader, autoescape=True, extensions=extensions, **options)
     environment.filters["css_color"] = css_color
+    environment.globals["gradient"] = ",".join(map(css_color, SHARES(np.linspace(0, 1, 9)).tolist()))
     return environment
 
 
