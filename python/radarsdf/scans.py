@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Array, Floats, Ints
+from radarsdf.arrays import Array, Bools, Floats, Ints
 from radarsdf.checks import MISSING_POSES, check, one_for_each_scan, pose_matrices
 from radarsdf.rig import Imu, Label, Rig
 
@@ -64,9 +64,13 @@ def finite_returns(scan: Scan, notes: "Notes") -> Scan:
         return scan
     what = "returns left out: a coordinate or the intensity is not a finite number"
     notes.count(what, int((~finite).sum()))
-    arrays = {name: getattr(scan, name) for name in _ARRAYS.values()}
-    kept: dict[str, Any] = {name: array[finite] for name, array in arrays.items() if array is not None}
-    return replace(scan, **kept)
+    return with_returns(scan, np.asarray(finite))
+
+
+def with_returns(scan: Scan, kept: Bools) -> Scan:
+    """Keep the returns in a mask (N,)."""
+    arrays: dict[str, Any] = {name: getattr(scan, name) for name in _ARRAYS.values()}
+    return replace(scan, **{name: array[kept] for name, array in arrays.items() if array is not None})
 
 
 class Notes:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +13,7 @@ from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
 from radarsdf.checks import are_rigid, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import measured, too_far
-from radarsdf.scans import Scans, filled
+from radarsdf.scans import Scans, filled, scans_in_memory, with_returns
 
 _EQUAL = 1e-6  # relative difference of equal ranges, from float32
 # A largest range is too frequent if more than 8 returns, and 5 times as many as at each of the next 10 ranges, have it.
@@ -157,13 +156,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         evidence = f"{counts[-1]} of {len(ranges)} returns are at exactly the largest range, {most:g} m."
         found.append(Finding("range_sentinel", "warning", evidence))
     kept = [mask & ~apart for mask, apart in zip(returns, far, strict=True)]
-    if not all(mask.all() for mask in kept):
-        columns: dict[str, Any] = {
-            name: [values[mask] for values, mask in zip(arrays, kept, strict=True)]
-            for name in ("points", "intensities", "doppler_mps")
-            if (arrays := getattr(recording, name)) is not None
-        }
-        recording = Scans(**columns, poses=recording.poses, times_s=recording.times_s)
+    recording = scans_in_memory([with_returns(*each) for each in zip(recording, kept, strict=True)])
     empty = np.array([not mask.any() for mask in kept])
     if empty.any():
         evidence = f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {empty.argmax()}."

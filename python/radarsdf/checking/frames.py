@@ -166,21 +166,15 @@ def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
         return False  # no sensor has all returns in one direction, unlike UTM coordinates
     moved = [(scan - T[:3, 3]) @ T[:3, :3] for scan, T in zip(given, recording.poses[rows], strict=True)]
     first, second = np.searchsorted(rows, pairs.T)
-    significances = []
-    for middle in (_centroid, _mean_direction):
-        before, after = (np.array([middle(scan) for scan in scans]) for scans in (given, moved))
-        steadier = np.linalg.norm(before[first] - before[second], axis=1)
-        steadier -= np.linalg.norm(after[first] - after[second], axis=1)
-        significances.append(Gain.of_samples(steadier).significance)
-    return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
+    middles = (np.array([_middles(scan) for scan in scans]) for scans in (given, moved))
+    before, after = (np.linalg.norm(middle[first] - middle[second], axis=2) for middle in middles)
+    return bool(Gain.of_samples(before - after).significance.sum() / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
 
 
-def _centroid(scan: Floats) -> Floats:
-    return np.median(scan, axis=0)
-
-
-def _mean_direction(scan: Floats) -> Floats:
-    return np.mean(scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None], axis=0)
+def _middles(scan: Floats) -> tuple[Floats, Floats]:
+    """Centroid (3,) of the returns (N, 3), and their mean direction (3,)."""
+    directions = scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]
+    return np.median(scan, axis=0), np.mean(directions, axis=0)
 
 
 _UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}

@@ -85,11 +85,8 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     >>> train.tolist(), test.tolist()
     ([1, 2, 4, 5], [0, 3, 6])
     """
-    if isinstance(frames, (int, np.integer)):
-        numbers = np.arange(frames)
-    else:
-        real_array(frames, "frames")
-        numbers = np.asarray(frames)
+    real_array(frames, "frames")
+    numbers = np.arange(frames) if isinstance(frames, (int, np.integer)) else np.asarray(frames)
     fits = not numbers.size or numbers.dtype.kind in "iu"
     check(fits, "frames must be a number of scans or integer frame numbers")
     numbers = np.unique(numbers)

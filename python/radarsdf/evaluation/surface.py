@@ -149,21 +149,17 @@ def format_metrics(metrics: Mapping[str, Any]) -> str:
         count = f"({metrics['num_returns']} returns, {metrics['protocol']})"
         return f"intensity error  mean {metrics['mae']:.2f}  median {metrics['medae']:.2f}  {count}"
 
-    def shown(name: str, unit: str, factor: float = 1.0, digits: int = 2) -> str:
+    def shown(name: str, unit: str = " %", factor: float = 100.0, digits: int = 2) -> str:
         value = metrics[name]
         return "undefined" if value is None else f"{value * factor:.{digits}f}{unit}"
 
-    def percent(name: str) -> str:
-        return shown(name, " %", 100)
-
     rows = {
-        "accuracy": f"error {shown('accuracy_error_m', ' cm', 100)}  ratio {percent('accuracy_ratio')}"
-        f"  outliers beyond {metrics['outlier_m']:g} m {percent('outlier_ratio')}",
-        "completion": f"error {shown('completion_error_m', ' cm', 100)}  ratio {percent('completion_ratio')}",
-        "F-score": f"{percent('f_score')}  with nothing discarded {percent('f_score_all')}"
-        f" (precision {percent('precision')})",
-        "angles": f"gamma shape {shown('gamma_shape', '')}  mean {shown('gamma_mean', ' rad', digits=3)}"
-        f"  variance {shown('gamma_variance', ' rad²', digits=3)}",
+        "accuracy": f"error {shown('accuracy_error_m', ' cm')}  ratio {shown('accuracy_ratio')}"
+        f"  outliers beyond {metrics['outlier_m']:g} m {shown('outlier_ratio')}",
+        "completion": f"error {shown('completion_error_m', ' cm')}  ratio {shown('completion_ratio')}",
+        "F-score": f"{shown('f_score')}  with nothing discarded {shown('f_score_all')} (precision {shown('precision')})",
+        "angles": f"gamma shape {shown('gamma_shape', '', 1)}  mean {shown('gamma_mean', ' rad', 1, 3)}"
+        f"  variance {shown('gamma_variance', ' rad²', 1, 3)}",
         "protocol": f"{metrics['protocol']}  threshold {metrics['threshold_m']:g} m  {metrics['num_mesh_samples']} mesh"
         f" samples and {metrics['num_ground_truth']} ground-truth points",
     }
