@@ -12,7 +12,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TypeVar
 
 import torch
@@ -44,7 +44,6 @@ class _State:
 
 
 _state = _State()
-_vector_library_started = False
 
 
 def _use_one_thread() -> None:
@@ -62,24 +61,20 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_reset_after_fork)
 
 
+@cache
 def start_vector_library() -> None:
     """Call PyTorch's transcendental functions once in this process, from a single thread.
 
     Their libraries detect the instruction set in the first call. If several threads make it at once, some get
     other last bits than later: about one in fifty processes would give another fit.
     """
-    global _vector_library_started  # noqa: PLW0603 - there is one PyTorch
-    with _state.lock:
-        if _vector_library_started:
-            return
-        with torch.no_grad():
-            for dtype in (torch.float32, torch.float64):
-                numbers = torch.full((_VECTOR_LENGTH,), 0.5, dtype=dtype, device="cpu")
-                for name in _TRANSCENDENTAL:
-                    getattr(torch, name)(*[numbers] * (2 if name == "pow" else 1))
-                functional.binary_cross_entropy_with_logits(numbers, numbers)
-                torch.randn(_VECTOR_LENGTH, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
-        _vector_library_started = True
+    with _state.lock, torch.no_grad():
+        for dtype in (torch.float32, torch.float64):
+            numbers = torch.full((_VECTOR_LENGTH,), 0.5, dtype=dtype, device="cpu")
+            for name in _TRANSCENDENTAL:
+                getattr(torch, name)(*[numbers] * (2 if name == "pow" else 1))
+            functional.binary_cross_entropy_with_logits(numbers, numbers)
+            torch.randn(_VECTOR_LENGTH, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
 
 
 def resolve_num_threads(num_threads: int) -> int:

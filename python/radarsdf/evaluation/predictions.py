@@ -49,9 +49,8 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
     TypeError
         If the values are not real numbers.
     """
-    p, m = real_array(predicted, "predicted"), real_array(measured, "measured")
-    fits = p.ndim == 1 and p.shape == m.shape and p.size != 0
-    check(fits, f"predicted {p.shape} and measured {m.shape} must both be (N,), with at least one return")
+    p, m = _paired(predicted, "predicted", measured, "measured")
+    check(p.size, "predicted and measured must both be (N,), with at least one return")
     error = np.abs(p - m)
     check(np.isfinite(error).all(), "predicted and measured must be finite")
     errors = {"mae": float(error.mean()), "medae": float(np.median(error))}

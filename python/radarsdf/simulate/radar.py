@@ -153,14 +153,17 @@ class RadarSensor:
         order = generator(seed, frame, _ORDER).permutation(sum(len(scan.points) for scan in scans))
         return SimulatedScan(*(np.concatenate(columns)[order] for columns in zip(*scans, strict=True)))
 
-    def echo_power_db(self, scene: Scene, origins: Floats, directions: Floats, hits: Hits) -> Floats:
+    def echo_power_db(
+        self, scene: Scene, origins: Floats, directions: Floats, hits: Hits, before_m: Floats | float = 0.0
+    ) -> Floats:
         """Received power (N,), dB, of surface hits by the radar equation, without speckle or clipping; -inf without a hit.
 
-        Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m.
+        Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m. `before_m`: paths (N,) to
+        the origins.
         """
         range_m = np.where(hits.primitive >= 0, hits.range_m, 1.0)
         echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
-        return self.gain_db + echo - self.range_loss_db * np.log10(range_m)
+        return self.gain_db + echo - self.range_loss_db * np.log10(before_m + range_m)
 
     def angles(self, u: Floats) -> Floats:
         """Azimuths and elevations (N, 2), rad, uniform in azimuth and in the sine of elevation for `u` (N, 2) uniform in 0..1."""
@@ -179,7 +182,7 @@ class RadarSensor:
     def _surface(self, scene: Scene, rays: _Rays, rng: np.random.Generator) -> _Echoes:
         hits = rays.hits
         noiseless = self.echo_power_db(scene, rays.origin, rays.directions, hits)
-        power = noiseless + _speckle_db(scene.material_values(hits, "looks", 1.0), rng)
+        power = noiseless + _speckle_db(scene, hits, rng)
         rows = (hits.primitive >= 0) & (hits.range_m >= self.min_range_m)
         return _Echoes(hits.range_m[rows], rays.angles[rows], power[rows], noiseless[rows])
 
@@ -193,17 +196,12 @@ class RadarSensor:
         mirrored = directions[rows] - 2 * cos[:, None] * normals
         mirror = origin + first[:, None] * directions[rows] + _OFF_SURFACE_M * normals
         second = scene.raycast(mirror, mirrored, self.max_range_m)
-        path = first + second.range_m
         # Where a mirror stands on the ground, the path to the next surface has zero length: this is no ghost.
-        seen = (path <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
-        rows, path = rows[seen], path[seen]
-        second = Hits(second.range_m[seen], second.normals[seen], second.primitive[seen])
-        mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
-        # The range in the radar equation is the full path, and the wave is attenuated at the mirror twice.
-        power = self.gain_db + scene.echo_db(target, mirrored, second)
-        power = power - self.range_loss_db * np.log10(path) - 2 * loss[rows]
-        looks = scene.material_values(second, "looks", 1.0)
-        return _Echoes(path, angles[rows], power + _speckle_db(looks, rng))
+        seen = (first + second.range_m <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
+        rows, first, second = rows[seen], first[seen], Hits(*(values[seen] for values in second))
+        # The wave is attenuated at the mirror twice.
+        power = self.echo_power_db(scene, mirror[seen], mirrored[seen], second, first) - 2 * loss[rows]
+        return _Echoes(first + second.range_m, angles[rows], power + _speckle_db(scene, second, rng))
 
     def _sidelobes(self, surface: _Echoes, rng: np.random.Generator) -> _Echoes:
         rows = np.flatnonzero(rng.random(len(surface.range_m)) < self.sidelobe_share)
@@ -281,9 +279,10 @@ def _hash(cells: Ints, key: int) -> Floats:
     return (mixed >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
-def _speckle_db(looks: Floats, rng: np.random.Generator) -> Floats:
-    """Fading (N,), dB, for numbers of scatterers (N,)."""
+def _speckle_db(scene: Scene, hits: Hits, rng: np.random.Generator) -> Floats:
+    """Fading (N,), dB, by the numbers of scatterers."""
     # Its median is 0, so a fit with the L1 loss, which estimates medians, finds the noiseless intensity.
+    looks = scene.material_values(hits, "looks", 1.0)
     power = rng.standard_gamma(looks)
     values, index = np.unique(looks, return_inverse=True)
     return 10 * np.log10(np.maximum(power, 1e-12) / gammaincinv(values, 0.5)[index])
