@@ -215,12 +215,10 @@ def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -
 
 
 def positive(value: Any, name: str) -> float:
-    """Convert to a positive finite float."""
     return _scalar(value, name, "positive and finite", lambda x: 0 < x < np.inf)
 
 
 def not_negative(value: Any, name: str) -> float:
-    """Convert to a finite float of at least 0."""
     return _scalar(value, name, "at least 0 and finite", lambda x: 0 <= x < np.inf)
 
 

@@ -61,8 +61,6 @@ Label: TypeAlias = Hashable  # name of a radar, such as that of its frame or top
 
 
 class Mounted(NamedTuple):
-    """Radar on a body."""
-
     label: Label
     T_body_sensor: Floats  # (4, 4) m
 

@@ -190,8 +190,6 @@ STILL = 1  # index of the hypothesis of a sensor that does not move between scan
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A hypothetical interpretation of the data."""
-
     finding: str  # name of the finding if the hypothesis is right
     what: str  # completes "the scans agree better if"
     T_j_i: Floats  # (P, 4, 4) motions between the frames of the original points of scan pairs

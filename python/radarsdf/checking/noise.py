@@ -129,12 +129,10 @@ _SOME_CLIPPED, _MANY_CLIPPED = 0.005, 0.05  # shares of returns at the highest v
 _ABOVE_NEXT = 5.0  # ratio to the share at each of the next values
 _FEW_VALUES = 1000  # distinct values: with more, quantisation does not matter
 _RCS_OFFSET = 128  # added to radar cross sections in dBsm to store them in a byte
-_LEAST_RETURNS = 100
 _NAMED = 3  # largest number of values in a message
 
 
 def check_intensities(recording: Scans) -> Iterator[Finding]:
-    """Check the intensities."""
     if recording.intensities is None:
         return
     whole = np.concatenate(recording.intensities)  # one value in any scan can stretch the common scale
@@ -160,7 +158,7 @@ def check_intensities(recording: Scans) -> Iterator[Finding]:
     elif constant > 0.5:
         evidence = f"In {constant:.0%} of the scans all returns have the same intensity."
         yield Finding("intensity_constant_in_scans", "warning", evidence)
-    elif len(values) >= _LEAST_RETURNS:
+    elif len(values) >= _FEW_RETURNS:
         yield from _scale(values)
 
 

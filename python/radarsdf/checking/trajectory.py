@@ -254,8 +254,7 @@ def check_drift(recording: Scans, config: FitConfig, *, undecided: bool = False)
 
 
 def _log_errors(errors: Floats) -> Floats:
-    """Negative log likelihoods (N,) of errors (N, 6) of steps, m, up to a constant: of unknown scale, so that few large ones
-    hardly count."""
+    """Negative log likelihoods (N,) of errors (N, 6) of steps, m, of unknown scale: few large ones hardly count."""
     return np.log(np.maximum(np.linalg.norm(errors, axis=1), _LEAST_ERROR))
 
 

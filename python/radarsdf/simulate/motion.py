@@ -19,7 +19,7 @@ from radarsdf.scans import Scans
 from .radar import RadarSensor, Simulation, generator, simulate
 from .world import Scene
 
-_MOTION_STREAM, _IMU_STREAM = 2**31 + 1, 2**31 + 2  # no scan has these numbers
+_MOTION_STREAM, _IMU_STREAM, _RIG_STREAM = 2**31 + 1, 2**31 + 2, 2**31 + 4  # no scan has these numbers
 _DOPPLER_SIGMA_MPS = 0.1
 _MOVING_SHARE, _MOVING_SIGMA_MPS = 0.1, 5.0  # share and speed of moving returns
 _GYROSCOPE_SIGMA_RAD_S = 0.005  # per component
@@ -215,9 +215,6 @@ def drifted(poses: Floats, sigma_m: float, sigma_rad: float, seed: int = 0, yaw_
     errors[:, 5] += yaw_rad
     pairs = zip(steps(poses), transform(errors[:, 3:], errors[:, :3]), strict=True)
     return np.stack([*accumulate(pairs, lambda T, pair: T @ pair[0] @ pair[1], initial=poses[0])])
-
-
-_RIG_STREAM = 2**31 + 4  # no scan has this index
 
 
 @dataclass(frozen=True, eq=False)

@@ -198,7 +198,8 @@ class RadarSensor:
         second = scene.raycast(mirror, mirrored, self.max_range_m)
         # Where a mirror stands on the ground, the path to the next surface has zero length: this is no ghost.
         seen = (first + second.range_m <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
-        rows, first, second = rows[seen], first[seen], Hits(*(values[seen] for values in second))
+        rows, first = rows[seen], first[seen]
+        second = Hits(second.range_m[seen], second.normals[seen], second.primitive[seen])
         # The wave is attenuated at the mirror twice.
         power = self.echo_power_db(scene, mirror[seen], mirrored[seen], second, first) - 2 * loss[rows]
         return _Echoes(first + second.range_m, angles[rows], power + _speckle_db(scene, second, rng))

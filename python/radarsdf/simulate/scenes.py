@@ -199,6 +199,11 @@ ASTYX_HIRES = RadarSensor(
     sidelobe_fov_rad=np.deg2rad(39),
 )  # fmt: skip
 
+_DRIVES = {  # radar, default number of scans, and height of the radar above the ground, m
+    "hugin": (HUGIN_A3, 120, 1.5), "oculii": (OCULII_EAGLE, 120, 1.1),
+    "wall": (HUGIN_A4, 90, 1.2), "astyx": (ASTYX_HIRES, 20, 1.25),
+}  # fmt: skip
+
 
 def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     """Simulate a dense and accurate radar on a drive of 60 m past walls, buildings, cars and poles on rolling ground.
@@ -221,7 +226,7 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     path = _lane(60.0, sway, 70, phase)
     site = Site(rng, terrain, taken=[(x, y, 2.2) for x, y in path(np.linspace(-0.1, 1.5, 200))])
     site.fill(_LANE, lambda near, far: site.beside(path, rng.uniform(0.1, 1.45), near, far))
-    return _drive(site, path, (frames, 120), HUGIN_A3, "hugin", seed, height_m=1.5)
+    return _drive("hugin", site, path, seed, frames)
 
 
 def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -252,7 +257,7 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
     for angle in np.arange(0, 2 * np.pi, 2 * np.pi / rng.integers(14, 22)):
         corner = np.clip(1.45 * np.array([np.cos(angle), np.sin(angle)]), -1, 1)
         site.pole(corner * np.array([length, width]), 0.0)
-    return _drive(site, path, (frames, 120), OCULII_EAGLE, "oculii", seed, height_m=1.1)
+    return _drive("oculii", site, path, seed, frames)
 
 
 def wall(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -282,7 +287,7 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
         angle, distance = np.deg2rad(160) * (u - 0.5), radius + 0.1 * np.sin(9 * u)
         return distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
-    return _drive(site, path, (frames, 90), HUGIN_A4, "wall", seed, height_m=1.2, look_at=mounted[:2])
+    return _drive("wall", site, path, seed, frames, look_at=mounted[:2])
 
 
 def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -301,7 +306,7 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     first, last = -10.0, length + 100.0
     site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in path(np.arange(first, last, 2.0) / length)])
     site.fill(_STREET, lambda near, far: site.beside(path, rng.uniform(first, last) / length, near, far))
-    return _drive(site, path, (frames, 20), ASTYX_HIRES, "astyx", seed, height_m=1.25)
+    return _drive("astyx", site, path, seed, frames)
 
 
 def _lane(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
@@ -313,18 +318,11 @@ def _lane(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
 
 
 def _drive(
-    site: Site,
-    path: Path,
-    frames: tuple[int | None, int],
-    sensor: RadarSensor,
-    name: str,
-    seed: int,
-    *,
-    height_m: float,
-    look_at: Floats | None = None,
+    name: str, site: Site, path: Path, seed: int, frames: int | None, look_at: Floats | None = None
 ) -> Simulation:
-    """Scan a site along a path. `frames`: number of scans, and its default."""
-    count = frames[1] if frames[0] is None else whole_number(frames[0], "frames", 1)
+    """Scan a site along a path."""
+    sensor, scans, height_m = _DRIVES[name]
+    count = scans if frames is None else whole_number(frames, "frames", 1)
     rng = generator(seed, _TRAJECTORY)
     poses = along_path(site.terrain, path, count, height_m=height_m, rng=rng, look_at=look_at)
     return simulate(Scene(site.solids, site.terrain), sensor, poses, name=name, seed=seed)

@@ -65,7 +65,6 @@ class Viewer(Page):
         self._painter.wait()
 
     def stop(self) -> None:
-        """Close the page and end all threads."""
         self._painter.stop()
         super().stop()
 

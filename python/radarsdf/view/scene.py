@@ -34,8 +34,6 @@ _POINTS = {"point_shading": "flat", "precision": "float32"}
 
 @dataclass(frozen=True)
 class State:
-    """State of the controls."""
-
     sensor: Position  # world, m
     limits: tuple[float, float]  # uncertainty, m, and confidence: arguments of :meth:`ShownSurface.kept`
     quantity: str = ""
@@ -71,7 +69,6 @@ class Painter:
             raise self._error
 
     def stop(self) -> None:
-        """End the thread after the current drawing."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

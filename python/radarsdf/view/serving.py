@@ -191,7 +191,6 @@ def has_display() -> bool:
 
 
 def url_of(host: str, port: int) -> str:
-    """The page's address for a browser on this machine."""
     if host in ("127.0.0.1", "::1", "0.0.0.0", "::"):
         return f"http://localhost:{port}"
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

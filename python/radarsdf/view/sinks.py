@@ -130,8 +130,6 @@ class FoxgloveSink(Sink):
 
 
 class RerunSink(Sink):
-    """Logs to a stream of rerun."""
-
     def __init__(self, rerun: Any, stream: Any) -> None:
         self._rerun, self._stream = rerun, stream
         stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

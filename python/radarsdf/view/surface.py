@@ -67,7 +67,6 @@ class ShownSurface:
         return cls(vertices, faces, uncertainty_m, confidence, lightness, threshold, spacing_m)
 
     def kept(self, max_uncertainty_m: float, min_confidence: float) -> Bools:
-        """Return a mask (V,) of vertices within the limits."""
         return Limits(None, max_uncertainty_m, 0).met(min_confidence, self.confidence, self.uncertainty_m)
 
     def part(self, kept: Bools) -> tuple[Ints, Ints32]:
