@@ -81,13 +81,6 @@ def check_box(box: ArrayLike) -> Floats:
     return positions(corners, "box")
 
 
-def check_scan_shapes(scans: Sequence[Array]) -> None:
-    """Refuse an empty sequence of scans, and scans that are not arrays (N, 3)."""
-    check(scans, "points holds no scans")
-    for i, scan in enumerate(scans):
-        check_scan_shape(scan, i)
-
-
 def check_scan_shape(scan: Array, number: int) -> None:
     check(scan.ndim == 2 and scan.shape[1] == 3, f"scan {number} must have shape (N, 3), not {scan.shape}")
 

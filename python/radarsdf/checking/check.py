@@ -156,7 +156,8 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
         evidence = f"{counts[-1]} of {len(ranges)} returns are at exactly the largest range, {most:g} m."
         found.append(Finding("range_sentinel", "warning", evidence))
     kept = [mask & ~apart for mask, apart in zip(returns, far, strict=True)]
-    recording = scans_in_memory([with_returns(*each) for each in zip(recording, kept, strict=True)])
+    if not all(mask.all() for mask in kept):
+        recording = scans_in_memory([with_returns(*each) for each in zip(recording, kept, strict=True)])
     empty = np.array([not mask.any() for mask in kept])
     if empty.any():
         evidence = f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {empty.argmax()}."

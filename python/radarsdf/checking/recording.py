@@ -111,7 +111,9 @@ def checked_input(
     Raises a TypeError or a ValueError that names the argument.
     """
     scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(checks.one_for_each_scan(points, "points"))]
-    checks.check_scan_shapes(scans)
+    checks.check(scans, "points holds no scans")
+    for i, scan in enumerate(scans):
+        checks.check_scan_shape(scan, i)
     T_world_sensor = checks.pose_matrices(poses, len(scans))
     times = None if times_s is None else checks.real_array(times_s, "times_s").copy()
     if times is not None:

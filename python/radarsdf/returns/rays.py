@@ -178,7 +178,7 @@ def check_scans(
         returns &= ~far
         left_out.empty += [] if returns.any() else [i]
         scans.append(scan if returns.all() else np.where(returns[:, None], scan, 0.0))
-    checks.check_scan_shapes(scans)
+    checks.check(scans, "points holds no scans")
     if intensities is None:
         return scans, None, left_out
     in_float32 = functools.partial(checks.real_array, dtype=np.float32)
