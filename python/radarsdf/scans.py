@@ -82,7 +82,6 @@ class Notes:
         self._counts: dict[str, tuple[int, str]] = {}
 
     def add(self, line: str) -> None:
-        """Add a sentence, and log it if it is new."""
         if line not in self.lines:
             self.lines.append(line)
             _LOG.warning(line)
@@ -98,7 +97,6 @@ class Notes:
             self._counts[what] = known + number, first
 
     def start_pass(self) -> None:
-        """Reset the counts before the files are read again."""
         self._counts = {}
 
     def end_pass(self) -> None:

@@ -32,7 +32,7 @@ from radarsdf.scans import Scans
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import MEANING, centre_of
-from radarsdf.view.serving import aim, framing_pose, free_port, start_server, stop_server
+from radarsdf.view.serving import LOCALHOST, aim, framing_pose, free_port, start_server, stop_server
 from radarsdf.view.surface import glb, templates_of, thinned
 
 MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
@@ -325,8 +325,7 @@ def scene(
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
     to_eye = eye_around(vertices) - middle_of(vertices)[0]
     pose = framing_pose(everything, to_eye, _SCENE_ASPECT)
-    host = "127.0.0.1"
-    server: Any = start_server(host, free_port(host, 0))
+    server: Any = start_server(LOCALHOST, free_port(LOCALHOST, 0))
     try:
         data = glb(np.round(vertices * _STEPS_PER_M) / _STEPS_PER_M, faces, colors)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)

@@ -43,8 +43,6 @@ _BITS = np.uint32(13)  # dropped mantissa bits, below the 256 levels of a screen
 
 @dataclass(frozen=True)
 class ShownSurface:
-    """Triangles and the attributes of their vertices."""
-
     vertices: Floats  # (V, 3) world, m
     faces: Ints32  # (F, 3) rows of vertices; normals point into free space
     uncertainty_m: Floats32  # (V,)
