@@ -154,11 +154,8 @@ def save_trajectory_picture(
     """
     poses = list(trajectories.values())[-1]
     step = max(1, sum(map(len, points)) // _MAX_RETURNS)
-    placed = [
-        np.einsum("ij,nj->ni", T[:2, :3], np.asarray(scan[::step], np.float64)) + T[:2, 3]
-        for scan, T in zip(points, poses, strict=True)
-    ]
-    world = np.concatenate(placed)
+    scans = zip((np.asarray(scan[::step], np.float64) for scan in points), poses, strict=True)
+    world = np.concatenate([np.einsum("ij,nj->ni", T[:2, :3], scan) + T[:2, 3] for scan, T in scans])
     paths = {name: path[:, :2, 3] for name, path in trajectories.items()}
     positions = np.concatenate(list(paths.values()))
     low, high = np.percentile(world, [1, 99], axis=0)

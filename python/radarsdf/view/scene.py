@@ -108,7 +108,6 @@ class Canvas:
         self._scans, self._shown = scans, shown
         self._local = (surface.vertices - radar_map.origin).astype(np.float32)
         self._spread, _, spacing_m = spread_evenly(surface.vertices, _DRAG_POINTS, surface.spacing_m)
-        self._cloud_rows = self._spread
         self._cloud_limits: tuple[float, float] | None = None
         self._drawn: Hashable = None  # what the mesh depends on
         self._meshes: list[Any] = []  # newest last; the older ones are removed once the page has drawn it
@@ -130,14 +129,11 @@ class Canvas:
         """Recolour the cloud and show it instead of the mesh, if the quantity depends on the sensor."""
         if not self._quantities[state.quantity].of_sensor:
             return
-        moved = state.limits != self._cloud_limits
-        if moved:
-            self._cloud_rows = self._spread[self._surface.kept(*state.limits)[self._spread]]
-            self._cloud_limits = state.limits
-        colors = self._colors(self._cloud_rows, state)
+        rows = self._spread[self._surface.kept(*state.limits)[self._spread]]
+        colors = self._colors(rows, state)
         with self._server.atomic():
-            if moved:
-                self._cloud.points = self._local[self._cloud_rows]
+            if state.limits != self._cloud_limits:
+                self._cloud_limits, self._cloud.points = state.limits, self._local[rows]
             self._cloud.colors = colors
             self.coarse = True
             self._cloud.visible = True
