@@ -10,7 +10,7 @@ from radarsdf.returns import reflectance, sensor
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.reflectance import LEVEL, NO_SURFACE, STEEP, Reflectance, Response, kinds_of
+from radarsdf.returns.reflectance import LEVEL, NO_SURFACE, STEEP, Reflectance, kinds_of
 
 LEAF_M = 0.2
 
@@ -84,7 +84,7 @@ COUNT = 6000
 
 
 def views(seed=0, kinds=(LEVEL, STEEP), count=COUNT):
-    """Directions, ranges, incidences and kinds of surfaces of random returns, as arguments of :meth:`Response.at`."""
+    """Directions, ranges, incidences and kinds of surfaces of random returns, as arguments of :func:`response`."""
     rng = np.random.default_rng(seed)
     elevation, azimuth = rng.uniform(-0.4, 0.4, count), rng.uniform(-1, 1, count)
     directions = np.stack(
@@ -103,7 +103,8 @@ def views(seed=0, kinds=(LEVEL, STEEP), count=COUNT):
 def error(values, seen, asked=None, truth=None):
     """Mean absolute error of predictions from `values` of returns."""
     asked, truth = (seen, values) if asked is None else (asked, truth)
-    return float(np.abs(Response.of(values, *seen).at(*asked) - truth).mean())
+    found = reflectance.response(*reflectance.fit_response(values, *seen), *asked)
+    return float(np.abs(found - truth).mean())
 
 
 def test_level_and_steep_surfaces_have_their_own_incidence():

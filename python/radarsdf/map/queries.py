@@ -120,9 +120,8 @@ def intensity(
             return found
         measured = (ranges_m >= nearest_m / RANGE_MARGIN) & (ranges_m <= farthest_m * RANGE_MARGIN)
         if field.reflectance is not None:
-            measured &= torch.from_numpy(
-                field.reflectance.response.measured(directions.numpy(), ranges_m.numpy())
-            )
+            of_views = directions.numpy(), ranges_m.numpy()
+            measured &= torch.from_numpy(field.reflectance.measured(*of_views))
         return found.where(measured, torch.nan)
 
     return evaluate(of_chunk, np.concatenate([points, sensors], axis=1))

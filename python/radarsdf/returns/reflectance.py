@@ -51,66 +51,59 @@ _UNMEASURED = -64.0
 _HALF = -32.0  # after the halving for a network
 
 
-@dataclass(frozen=True)
-class Response:
-    """Intensity as a function of range, elevation, incidence and the kind of surface."""
+@np.errstate(under="ignore")  # lobes and kernels underflow far from their centre
+def fit_response(
+    values: Floats32,
+    directions: Floats32,
+    ranges_m: Floats32,
+    incidence_rad: Floats32,
+    kinds: NDArray[np.int8],
+) -> tuple[Floats, Floats32]:
+    """Fit `coefficients` and `table` of a :class:`Reflectance` to `values` (N,) of returns; the others as for :func:`response`."""
+    some = slice(None, None, -(-len(values) // _MOST_REGRESSED))
+    chosen, y = kinds[some], values[some].astype(np.float64)
+    rays = _of_ray(directions[some], ranges_m[some]).astype(np.float64)
+    coefficients = np.zeros((NUM_KINDS, NUM_COEFFICIENTS))
+    coefficients[:, :_BASE] = regression(rays, y)
+    left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
+    table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
+    table[~_near(_bins(_log_range(ranges_m), directions[:, 2]))] += _UNMEASURED
+    for kind in (LEVEL, STEEP):
+        own = chosen == kind
+        if np.count_nonzero(own) >= _FEWEST:
+            of_incidence = _of_incidence(incidence_rad[some][own].astype(np.float64))
+            # Both have a column of ones: the ridge makes the system regular.
+            coefficients[kind] = regression(np.concatenate([rays[own], of_incidence], axis=1), y[own])
+    return coefficients, table.astype(np.float32)
 
-    coefficients: Floats  # (3, 14) of the regression for each kind of surface
-    table: Floats32  # (48, 96) residuals of the first of them by range and elevation, plus `_UNMEASURED` far from returns
 
-    @classmethod
-    @np.errstate(under="ignore")  # lobes and kernels underflow far from their centre
-    def of(
-        cls,
-        values: Floats32,
-        directions: Floats32,
-        ranges_m: Floats32,
-        incidence_rad: Floats32,
-        kinds: NDArray[np.int8],
-    ) -> "Response":
-        """Fit the response to `values` (N,) of returns; the other arguments are those of :meth:`at`."""
-        some = slice(None, None, -(-len(values) // _MOST_REGRESSED))
-        chosen, y = kinds[some], values[some].astype(np.float64)
-        rays = _of_ray(directions[some], ranges_m[some]).astype(np.float64)
-        coefficients = np.zeros((NUM_KINDS, NUM_COEFFICIENTS))
-        coefficients[:, :_BASE] = regression(rays, y)
-        left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
-        table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
-        table[~_near(_bins(_log_range(ranges_m), directions[:, 2]))] += _UNMEASURED
-        for kind in (LEVEL, STEEP):
-            own = chosen == kind
-            if np.count_nonzero(own) >= _FEWEST:
-                of_incidence = _of_incidence(incidence_rad[some][own].astype(np.float64))
-                # Both have a column of ones: the ridge makes the system regular.
-                coefficients[kind] = regression(np.concatenate([rays[own], of_incidence], axis=1), y[own])
-        return cls(coefficients, table.astype(np.float32))
-
-    @np.errstate(under="ignore")
-    def at(
-        self, directions: Floats32, ranges_m: Floats32, incidence_rad: Floats32, kinds: NDArray[np.int8]
-    ) -> Floats32:
-        """Predict values (N,) along directions (N, 3) from ranges (N,), m, at incidence angles (N,) on kinds of surface (N,)."""
-        of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
-        tables = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in self.coefficients]
-        found = np.empty(len(kinds), np.float32)
-        for first in range(0, len(kinds), _ROWS_AT_ONCE):
-            for kind in range(NUM_KINDS):
-                own = first + np.flatnonzero(kinds[first : first + _ROWS_AT_ONCE] == kind)
-                columns = _of_ray(directions[own], ranges_m[own])
-                values = _weighted_sum(self.coefficients[kind, :_BASE], columns.T)
-                if kind == NO_SURFACE:
-                    residuals = self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
-                    values += residuals - _HALF * np.rint(residuals / _HALF)
-                else:
-                    # Nearest tabulated angle: interpolation would dominate the time.
-                    nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
-                    values += tables[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
-                found[own] = values
-        return found
-
-    def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
-        """Return a mask (N,) of the directions (N, 3) and ranges (N,), m, near which there were returns."""
-        return (self.table > _HALF / 2).ravel()[_bins(_log_range(ranges_m), directions[:, 2])]
+@np.errstate(under="ignore")
+def response(
+    coefficients: Floats,
+    table: Floats32,
+    directions: Floats32,
+    ranges_m: Floats32,
+    incidence_rad: Floats32,
+    kinds: NDArray[np.int8],
+) -> Floats32:
+    """Predict values (N,) along directions (N, 3) from ranges (N,), m, at incidence angles (N,) on kinds of surface (N,)."""
+    of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
+    by_angle = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in coefficients]
+    found = np.empty(len(kinds), np.float32)
+    for first in range(0, len(kinds), _ROWS_AT_ONCE):
+        for kind in range(NUM_KINDS):
+            own = first + np.flatnonzero(kinds[first : first + _ROWS_AT_ONCE] == kind)
+            columns = _of_ray(directions[own], ranges_m[own])
+            values = _weighted_sum(coefficients[kind, :_BASE], columns.T)
+            if kind == NO_SURFACE:
+                residuals = table.ravel()[_bins(columns[:, 1], columns[:, 3])]
+                values += residuals - _HALF * np.rint(residuals / _HALF)
+            else:
+                # Nearest tabulated angle: interpolation would dominate the time.
+                nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
+                values += by_angle[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
+            found[own] = values
+    return found
 
 
 def kinds_of(normals: Floats32, plane: Ints | Ints32) -> NDArray[np.int8]:
@@ -243,17 +236,13 @@ class Reflectance:
     """
 
     leaf_size_m: float  # edge of a leaf cell, m
-    coefficients: Floats  # (3, 14), see :class:`~radarsdf.returns.reflectance.Response`
-    table: Floats32  # (48, 96) residuals of the first of them by range and elevation
+    coefficients: Floats  # (3, 14) of the regression for each kind of surface
+    table: Floats32  # (48, 96) residuals of the first of them by range and elevation, plus `_UNMEASURED` far from returns
     plane_keys: Keys  # (P,) Morton keys of the surfels' cells with a plane, ascending
     normals: Floats32  # (P, 3) unit normals of these planes, local frame
     mean_keys: Keys  # (M,) keys of the cells with means
     means: NDArray[np.float16]  # (M,) means of the regression's residuals in them
     network_share: float = 0.0  # factor on the intensity network's prediction, to which this is added
-
-    @cached_property
-    def response(self) -> Response:
-        return Response(self.coefficients, self.table)
 
     @cached_property
     def _planes(self) -> CellBlocks:
@@ -298,22 +287,22 @@ class Reflectance:
         if ask is not None:
             unit_vectors = places[1] / np.linalg.norm(places[1], axis=1, keepdims=True)
             answers = ask(places[0], unit_vectors, groups.means(ranges_m))
-            unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
+            unit = unit - np.float32(_NETWORK_TIMES) * answers[groups.rows]
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
-        response = Response.of(unit, directions, ranges_m, incidence, kinds)
-        left = unit - response.at(directions, ranges_m, incidence, kinds)
+        views = directions, ranges_m, incidence, kinds
+        coefficients, table = fit_response(unit, *views)
+        left = unit - response(coefficients, table, *views)
         incidence = groups.means(incidence)
-        del plane, kinds  # per-return arrays: frees memory
+        del plane, kinds, views  # per-return arrays: frees memory
         columns = (*places, incidence, groups.means(left), groups.weights)
         options = (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads)
         keys, means, explained = fit_cell_means(_in_metres(_KINDS, leaf_size_m), _TILINGS, *columns, *options)
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
-        coefficients = response.coefficients.copy()
-        coefficients[:, 0] += np.median(left - groups.of_returns(explained))
+        coefficients[:, 0] += np.median(left - explained[groups.rows])
         return cls(
             leaf_size_m,
             times * coefficients,
-            np.float32(times) * response.table,
+            np.float32(times) * table,
             surfels.keys[surfels.cell_of_plane[flat]],
             normals[flat],
             keys,
@@ -331,9 +320,14 @@ class Reflectance:
         directions = np.ascontiguousarray(directions)
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
         incidence = _incidence(self.normals, rows, directions)
-        found = self.response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
+        views = directions, ranges_m, incidence, kinds_of(self.normals, rows)
+        found = response(self.coefficients, self.table, *views)
         found += self._cells.sums(near, directions, incidence, num_threads)
         return found
+
+    def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
+        """Return a mask (N,) of the directions (N, 3) and ranges (N,), m, near which there were returns."""
+        return (self.table > _HALF / 2).ravel()[_bins(_log_range(ranges_m), directions[:, 2])]
 
 
 def _in_metres(kinds: Floats, leaf_size_m: float) -> Floats:
@@ -354,15 +348,15 @@ def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats
 class _Groups:
     """Returns grouped by place and view. With few returns, each is its own group."""
 
-    rows: Ints32 | None  # (N,) row of each return's group. None: one group a return
+    rows: Ints | Ints32  # (N,) row of each return's group
     counts: Floats  # (G,) number of returns
 
     @classmethod
     def of(cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> "_Groups":
-        if len(points) <= _MOST_RETURNS:
-            return cls(None, np.ones(len(points)))
-        rows, count = cell_rows(kind, points, directions, incidence_rad)
-        return cls(rows, np.bincount(rows, minlength=count).astype(np.float64))
+        rows: Ints | Ints32 = np.arange(len(points))
+        if len(points) > _MOST_RETURNS:
+            rows, _ = cell_rows(kind, points, directions, incidence_rad)
+        return cls(rows, np.bincount(rows).astype(np.float64))
 
     @property
     def weights(self) -> Floats32:
@@ -370,11 +364,6 @@ class _Groups:
 
     def means(self, values: Floats32) -> Floats32:
         """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns."""
-        if self.rows is None:
-            return np.ascontiguousarray(values)
         sums = [np.bincount(self.rows, column, len(self.counts)) for column in np.atleast_2d(values.T)]
         means = (np.stack(sums) / self.counts).T.reshape(-1, *values.shape[1:])
         return np.ascontiguousarray(means, np.float32)
-
-    def of_returns(self, values: Floats32) -> Floats32:
-        return values if self.rows is None else values[self.rows]
