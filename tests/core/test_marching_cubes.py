@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from radarsdf.map.marching_cubes import extract_cells, marching_cubes, mesh_components, sparse_lattice
+from radarsdf._core import mesh_components
+from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
 
 from ..mesh_checks import (
     area,
@@ -190,7 +191,7 @@ def test_components_are_labelled_in_order():
     is_small = vertices[faces[:, 0], 0] < 17
     assert is_small[0], "the small sphere comes first along x"
     for order in (slice(None), slice(None, None, -1)):
-        labels, sizes = mesh_components(faces[order], len(vertices))
+        labels, sizes = mesh_components(np.ascontiguousarray(faces[order]), len(vertices))
         assert labels[0] == 0
         assert np.array_equal(labels == labels[0], is_small[order] == is_small[order][0])
         assert np.array_equal(sizes, np.bincount(labels))
@@ -214,4 +215,4 @@ def test_empty_meshes_have_no_components_and_wrong_faces_are_rejected():
     assert labels.shape == sizes.shape == (0,)
     for bad in ([[0, 1, 3]], [[-1, 0, 1]]):
         with pytest.raises(ValueError, match="does not exist"):
-            mesh_components(bad, 3)
+            mesh_components(np.array(bad, np.int32), 3)

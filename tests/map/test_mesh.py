@@ -6,8 +6,8 @@ import functools
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf._core import mesh_components
 from radarsdf.map.colors import intensity_colors
-from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.mesh import _corner_distances, crossed
 from radarsdf.map.radar_map import RadarMap
 from scipy.spatial import KDTree

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
+from radarsdf._core import mesh_components
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Threshold
 

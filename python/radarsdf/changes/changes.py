@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._core import mesh_components
 from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
 from radarsdf.changes.alignment import Alignment, align
 from radarsdf.changes.probability import Differences, Errors, PlacedMap, Side, posterior, share_of_changes
@@ -17,7 +18,6 @@ from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_free_space
 from radarsdf.io.meshes import write_mesh
 from radarsdf.map.map import Map
-from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.mesh import renumbered
 from radarsdf.map.threshold import across_triangles
 from radarsdf.scans import Scans

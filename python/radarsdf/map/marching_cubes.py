@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from radarsdf import _core
-from radarsdf.arrays import Array, Bools, Floats, Ints, Ints32
+from radarsdf.arrays import Array, Bools, Floats, Ints32
 from radarsdf.checks import check, real_array, refuse_masked
 
 
@@ -123,11 +123,6 @@ def extract_cells(
 def sparse_lattice(cells: Array, *, num_threads: int = 0) -> tuple[Ints32, Ints32, Ints32]:
     """Return the sorted unique cells (M', 3) of lower corners (M, 3), their sorted corners (K, 3), and rows of these (M', 8)."""
     return _core.sparse_lattice(np.ascontiguousarray(cells, np.int32), num_threads)
-
-
-def mesh_components(faces: Array, num_vertices: int) -> tuple[Ints32, Ints]:
-    """Label connected components of faces (F, 3): labels (F,), in order of their first faces, and sizes (C,)."""
-    return _core.mesh_components(np.ascontiguousarray(faces, np.int32), num_vertices)
 
 
 class _MarchingCubes(torch.autograd.Function):

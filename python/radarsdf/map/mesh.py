@@ -11,13 +11,13 @@ import torch
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import vertex_areas
+from radarsdf._core import mesh_components, vertex_areas
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
-from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_mesh
@@ -117,14 +117,6 @@ def renumbered(num_vertices: int, faces: Ints32) -> tuple[Bools, Ints32]:
     used[faces] = True
     renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
     return used, renumbered.take(faces)
-
-
-def one_for_equal(vertices: Floats, rows: Ints) -> Ints32:
-    """Map vertices (V,) to themselves, and those at `rows` (B,) to the first one at the same position."""
-    found = np.arange(len(vertices), dtype=np.int32)
-    _, first, which = np.unique(vertices[rows], axis=0, return_index=True, return_inverse=True)
-    found[rows] = rows[first][which.ravel()]
-    return found
 
 
 def extract_triangles(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ VOXEL_M = 0.1
 """Default edge of a mesh's voxels, m."""
 _BINS = 1000  # bins of the confidence from 0 to 1
 _SCALARS = 3
-TALLY_NUMBERS = 3 * _BINS + _SCALARS  # length of :meth:`Tally.sums`
+TALLY_NUMBERS = 3 * _BINS + _SCALARS  # length of `Tally.sums`
 _COMPONENT_TRIANGLES = 30  # minimum size of a component in voxels of VOXEL_M
 
 
@@ -78,14 +78,12 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Tally:
-    """Area of a map's surface by confidence. Additive over parts of a map, such as tiles."""
+    """Area of a map's surface by confidence. Sums are additive over parts of a map, such as tiles."""
 
-    area_m2: Floats  # (B,) area of the surface in each of B equal bins of the confidence from 0 to 1
-    true_m2: Floats  # (B,) expected true area
-    covering: Floats  # (B,) true surface newly covered as the threshold falls, up to a constant factor
-    existing_m2: float  # expected true surface, regardless of the accuracy of its position
-    once_m2: float  # expected true surface with a single hit (one scan in one cell)
-    twice_m2: float  # expected true surface with two hits
+    # (3 B + 3,) in each of B equal bins of the confidence from 0 to 1: area, m²; expected true area, m²; true surface newly
+    # covered as the threshold falls, up to a constant factor. Then expected true surface, m²: regardless of the accuracy of
+    # its position; with a single hit (one scan in one cell); with two hits.
+    sums: Floats
 
     @classmethod
     def of(
@@ -99,20 +97,11 @@ class Tally:
 
         sums = [np.bincount(bins, values, _BINS) for values in (area_m2, true_m2, covering * area_m2)]
         scalars = (np.minimum(existing_m2, area_m2), true_m2[scans == 1], true_m2[scans == 2])
-        return cls.of_sums(np.concatenate([*sums, [values.sum() for values in scalars]]))
-
-    def sums(self) -> Floats:
-        return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
-
-    @classmethod
-    def of_sums(cls, sums: Floats) -> "Tally":
-        area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _BINS)
-        existing_m2, once_m2, twice_m2 = sums[-_SCALARS:].tolist()
-        return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)
+        return cls(np.concatenate([*sums, [values.sum() for values in scalars]]))
 
     def threshold(self, min_confidence: float | None = None) -> Threshold:
         """Return the threshold of the highest expected F-score, or the expected quality at a given confidence."""
-        of_bins = (self.area_m2, self.true_m2, self.covering)
+        of_bins = self.sums[:-_SCALARS].reshape(-1, _BINS)
         kept_m2, true_m2, covering = (np.cumsum(values[::-1])[::-1] for values in of_bins)
         precision = np.divide(true_m2, kept_m2, out=np.zeros_like(true_m2), where=kept_m2 > 0)
         coverage = covering / covering[0] if covering[0] > 0 else covering
@@ -133,11 +122,12 @@ class Tally:
         """Share of the observed surface that can be covered: it has returns, and its position is accurate enough."""
         # Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: Chao's estimator of
         # unseen species. Surface that no ray reaches leaves no trace in these counts.
-        true_m2 = float(self.true_m2.sum())
-        if true_m2 == 0 or (self.once_m2 > 0 and self.twice_m2 == 0):
+        true_m2 = float(self.sums[_BINS : 2 * _BINS].sum())
+        existing_m2, once_m2, twice_m2 = self.sums[-_SCALARS:].tolist()
+        if true_m2 == 0 or (once_m2 > 0 and twice_m2 == 0):
             return 0.0
-        unseen_m2 = self.once_m2**2 / (2 * self.twice_m2) if self.once_m2 > 0 else 0.0
-        return true_m2 / (true_m2 + unseen_m2) * true_m2 / self.existing_m2
+        unseen_m2 = once_m2**2 / (2 * twice_m2) if once_m2 > 0 else 0.0
+        return true_m2 / (true_m2 + unseen_m2) * true_m2 / existing_m2
 
 
 def across_triangles(vertices: Floats, faces: Ints32) -> tuple[Floats, Floats]:

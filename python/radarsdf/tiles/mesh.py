@@ -20,7 +20,7 @@ from radarsdf.io.meshes import MATT, MESH_SUFFIXES, T_GLTF_WORLD, encode_glb, wr
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
-from radarsdf.map.mesh import Surface, crossed, one_for_equal, per_cell, renumbered, subdivided
+from radarsdf.map.mesh import Surface, crossed, per_cell, renumbered, subdivided
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
@@ -36,7 +36,7 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
     "confidence": (np.float32, None),
     "uncertainty_m": (np.float32, None),
     "cells": (np.int64, 2),  # numbers of leaf cells, and of those that may contain surface
-    "tally": (np.float64, TALLY_NUMBERS),  # Tally.sums of the whole surface of the tile
+    "tally": (np.float64, TALLY_NUMBERS),  # of the whole surface of the tile
 }  # in the file of a part, the triangles of one tile
 
 
@@ -74,10 +74,10 @@ def parts_of(
             surface, leaf_cells = _surface(city, planned.tile, steps, corners)
             arrays = {name: value for name, value in vars(surface).items() if name in _ARRAYS}
             counts = np.array([leaf_cells, surface.cells_searched])
-            write_arrays(path, arrays | {"cells": counts, "tally": surface.tally.sums()})
+            write_arrays(path, arrays | {"cells": counts, "tally": surface.tally.sums})
         paths.append(path)
     tally = sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS))
-    return paths, limits, Tally.of_sums(tally)
+    return paths, limits, Tally(tally)
 
 
 def _surface(city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = None) -> tuple[Surface, int]:
@@ -118,11 +118,14 @@ def _on_borders(city: TileBlend, vertices: Floats) -> Ints:
 
 
 def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]) -> tuple[Floats, Ints32]:
-    """Merge the vertices (V, 3) and faces (F, 3) of all parts, without duplicate vertices."""
+    """Merge the vertices (V, 3) and faces (F, 3) of all parts, with one vertex for equal ones on borders of tiles."""
     starts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
     merged = np.concatenate([part + start for part, start in zip(faces, starts, strict=False)])
     together = np.concatenate(vertices)
-    return together, one_for_equal(together, _on_borders(city, together))[merged]
+    own, rows = np.arange(len(together), dtype=np.int32), _on_borders(city, together)
+    _, first, which = np.unique(together[rows], axis=0, return_index=True, return_inverse=True)
+    own[rows] = rows[first][which.ravel()]
+    return together, own[merged]
 
 
 def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> trimesh.Trimesh:
