@@ -24,3 +24,8 @@ def turned(points: Array, R: Array) -> Floats:
     # By coordinate, which is as fast as BLAS; by row takes three times as long.
     columns = np.ascontiguousarray(points.T, np.float64)
     return np.ascontiguousarray(np.einsum("ij,jn->in", R, columns).T)  # the core needs contiguous rows
+
+
+def transformed(points: Array, T: Array) -> Floats:
+    """(N, 3) points transformed by the pose T (4, 4), float64."""
+    return turned(points, T[:3, :3]) + T[:3, 3]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.evidence import ReturnsOfCells
-from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.noise import NOISE_SETTINGS, SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
@@ -143,7 +143,9 @@ def test_variances_of_positions_by_range():
     np.testing.assert_allclose(noise.mean_variances_m2(ranges_m), (0.01 + (0.005 * ranges_m) ** 2) / 3)
     noises = [noise, SensorNoise(0.3, 0.001, 0.002), SensorNoise(0.2, 0.002, 0.009)]
     assert dataclasses.astuple(SensorNoise.median(noises)) == pytest.approx((0.2, 0.002, 0.004))
-    assert ReturnsConfig(**noise.settings).elevation_noise_rad == 0.004
+    assert (
+        ReturnsConfig(**dict(zip(NOISE_SETTINGS, noise.deviations, strict=True))).elevation_noise_rad == 0.004
+    )
 
 
 def test_errors_of_poses_are_common_to_the_returns_of_a_scan():

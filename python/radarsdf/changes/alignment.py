@@ -13,7 +13,7 @@ from radarsdf.map.threshold import across_triangles
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.rigid import moved, rotation_vector, skew
 from radarsdf.poses.search import Lost, OrientedPoints, SurfaceIndex, search
-from radarsdf.products import turned
+from radarsdf.products import transformed, turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.threads import resolve_num_threads
 
@@ -58,7 +58,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
 
     def far(pose: Floats) -> Floats:
         """(N,) logarithms of the distances between the surfaces, about equal where the surfaces coincide."""
-        near_m, _, distance_m = before.nearest(_transformed(surface.points, pose))
+        near_m, _, distance_m = before.nearest(transformed(surface.points, pose))
         distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
         return np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
 
@@ -72,7 +72,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         found = searched
     with contextlib.suppress(Lost):
         place = _place(before, after)
-        points, normals = _transformed(surface.points, place), turned(surface.normals, place[:3, :3])
+        points, normals = transformed(surface.points, place), turned(surface.normals, place[:3, :3])
         near = replace(surface, points=points, normals=normals, centre=points.mean(axis=0))
         searched = _constrained_pose(before, near, np.eye(4))
         if nearer(found[0], searched[0] @ place):
@@ -84,7 +84,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     if (own is surface and sigmas <= by_chance) or far(pose).mean() >= far(np.eye(4)).mean():
         words = "The frames were taken as they are: surfaces do not show an offset between them."
         return Alignment(covariance=covariance, centre=own.centre, words=words)
-    moved_m = np.sqrt(((_transformed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
+    moved_m = np.sqrt(((transformed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
     how = f"{sigmas:.1f} standard errors" if own is surface else "to the only place where it fits"
     words = (
         f"The later map was moved by {moved_m:.3f} m, {how}; "
@@ -180,7 +180,7 @@ def _gauss_newton(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[F
     prior = np.diag(_PRIOR_SIGMAS**-2.0)
     covariance = np.linalg.inv(prior)
     for _ in range(_ITERATIONS):
-        there, own = _transformed(surface.points, pose), turned(surface.normals, pose[:3, :3])
+        there, own = transformed(surface.points, pose), turned(surface.normals, pose[:3, :3])
         offset = surface.offset(pose)
         near_m, rows, distance_m = before.nearest(there)
         normals = before.normals[rows]
@@ -206,10 +206,6 @@ def _gauss_newton(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[F
         if np.einsum("i,i->", step, -gradient) < 0.01:
             break
     return pose, np.asarray(covariance, np.float64)
-
-
-def _transformed(points: Floats, pose: Floats) -> Floats:
-    return turned(points, pose[:3, :3]) + pose[:3, 3]
 
 
 def _jacobian(from_centre: Floats, normals: Floats) -> Floats:

@@ -20,6 +20,7 @@ from radarsdf.io.meshes import write_mesh
 from radarsdf.map.map import Map
 from radarsdf.map.mesh import renumbered
 from radarsdf.map.threshold import across_triangles
+from radarsdf.products import transformed
 from radarsdf.scans import Scans
 
 UNSEEN, SAME, GONE, APPEARED, MOVED, REFLECTANCE_CHANGED = -1, 0, 1, 2, 3, 4
@@ -280,7 +281,7 @@ def compare(
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
-    vertices = own_map.to_common(own_map.vertices)
+    vertices = transformed(own_map.vertices, own_map.T_common_map)
     own = own_map.evidence(vertices)
     other = other_map.evidence(vertices, own.normals)
     sigma_m = np.hypot(np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals)), other.sigma_m)

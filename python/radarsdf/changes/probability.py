@@ -19,7 +19,7 @@ from radarsdf.arrays import Bools, Floats, Ints, Ints32
 from radarsdf.map.confidence import confidence, uncertainty
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import across_triangles
-from radarsdf.products import turned
+from radarsdf.products import transformed, turned
 from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
 # Reach of distances around the surface of a field: returns scatter into the next cells.
@@ -96,10 +96,6 @@ class PlacedMap:
     def to_own(self, x: Floats) -> Floats:
         """Transform places (N, 3) from the common frame to the world of the map."""
         return turned(x - self.T_common_map[:3, 3], self.T_common_map[:3, :3].T)
-
-    def to_common(self, x: Floats) -> Floats:
-        """Transform places (N, 3) from the map's world to the common frame."""
-        return turned(x, self.T_common_map[:3, :3]) + self.T_common_map[:3, 3]
 
     def evidence(self, x: Floats, facing: Floats | None = None) -> PlaceEvidence:
         """Evidence at places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
@@ -306,8 +302,9 @@ class Differences:
         scales = [p.radar_map.intensity_scale for p in (before, after)]
         days = []
         for p in (before, after):
-            day, R = p.radar_map.view_statistics(), p.T_common_map[:3, :3]
-            days.append(replace(day, points=p.to_common(day.points), directions=turned(day.directions, R)))
+            day, T = p.radar_map.view_statistics(), p.T_common_map
+            directions = turned(day.directions, T[:3, :3])
+            days.append(replace(day, points=transformed(day.points, T), directions=directions))
         if None in scales or not all(len(day.counts) for day in days):
             return "Reflectance was not compared: a map has no intensities."
         leaf_m = max(before.leaf_m, after.leaf_m)

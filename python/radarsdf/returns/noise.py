@@ -60,11 +60,6 @@ class SensorNoise:
         return SensorNoise(*self.deviations)
 
     @property
-    def settings(self) -> dict[str, float]:
-        """Settings of ``config.returns`` with which a fit does not estimate the noise."""
-        return dict(zip(NOISE_SETTINGS, self.deviations, strict=True))
-
-    @property
     def angle_rad(self) -> float:
         """Standard deviation across the beam: root mean square of azimuth and elevation, rad."""
         return float(np.hypot(self.azimuth_rad, self.elevation_rad) / np.sqrt(2))

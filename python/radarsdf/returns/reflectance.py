@@ -281,24 +281,25 @@ class Reflectance:
         plane = surfels.flat_planes_at(points, num_threads)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)
-        groups = _Groups.of(points, directions, incidence, kind)
-        places = groups.means(points), groups.means(directions)
+        groups = _groups(points, directions, incidence, kind)
+        places = _means(points, groups), _means(directions, groups)
         times, share = 1.0, 0.0
         if ask is not None:
             unit_vectors = places[1] / np.linalg.norm(places[1], axis=1, keepdims=True)
-            answers = ask(places[0], unit_vectors, groups.means(ranges_m))
-            unit = unit - np.float32(_NETWORK_TIMES) * answers[groups.rows]
+            answers = ask(places[0], unit_vectors, _means(ranges_m, groups))
+            unit = unit - np.float32(_NETWORK_TIMES) * answers[groups]
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         views = directions, ranges_m, incidence, kinds
         coefficients, table = fit_response(unit, *views)
         left = unit - response(coefficients, table, *views)
-        incidence = groups.means(incidence)
+        incidence, counts = _means(incidence, groups), np.bincount(groups).astype(np.float64)
         del plane, kinds, views  # per-return arrays: frees memory
-        columns = (*places, incidence, groups.means(left), groups.weights)
+        weights = (counts / (1 + _CORRELATION * (counts - 1))).astype(np.float32)
+        columns = (*places, incidence, _means(left, groups), weights)
         options = (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads)
         keys, means, explained = fit_cell_means(_in_metres(_KINDS, leaf_size_m), _TILINGS, *columns, *options)
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
-        coefficients[:, 0] += np.median(left - explained[groups.rows])
+        coefficients[:, 0] += np.median(left - explained[groups])
         return cls(
             leaf_size_m,
             times * coefficients,
@@ -344,26 +345,15 @@ def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats
     return angle
 
 
-@dataclass(frozen=True)
-class _Groups:
-    """Returns grouped by place and view. With few returns, each is its own group."""
+def _groups(points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> Ints | Ints32:
+    """Group returns by place and view: return the row (N,) of each one's group. With few returns, each is its own."""
+    if len(points) <= _MOST_RETURNS:
+        return np.arange(len(points))
+    return cell_rows(kind, points, directions, incidence_rad)[0]
 
-    rows: Ints | Ints32  # (N,) row of each return's group
-    counts: Floats  # (G,) number of returns
 
-    @classmethod
-    def of(cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> "_Groups":
-        rows: Ints | Ints32 = np.arange(len(points))
-        if len(points) > _MOST_RETURNS:
-            rows, _ = cell_rows(kind, points, directions, incidence_rad)
-        return cls(rows, np.bincount(rows).astype(np.float64))
-
-    @property
-    def weights(self) -> Floats32:
-        return (self.counts / (1 + _CORRELATION * (self.counts - 1))).astype(np.float32)
-
-    def means(self, values: Floats32) -> Floats32:
-        """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns."""
-        sums = [np.bincount(self.rows, column, len(self.counts)) for column in np.atleast_2d(values.T)]
-        means = (np.stack(sums) / self.counts).T.reshape(-1, *values.shape[1:])
-        return np.ascontiguousarray(means, np.float32)
+def _means(values: Floats32, groups: Ints | Ints32) -> Floats32:
+    """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns."""
+    sums = np.stack([np.bincount(groups, column) for column in np.atleast_2d(values.T)])
+    means = (sums / np.bincount(groups)).T.reshape(-1, *values.shape[1:])
+    return np.ascontiguousarray(means, np.float32)

@@ -21,7 +21,7 @@ from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import StaticReturns
-from radarsdf.returns.noise import RigNoise, SensorNoise, rig_noise, sensor_noise
+from radarsdf.returns.noise import NOISE_SETTINGS, RigNoise, SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import SAME_UNIT, Sensor, Unit, in_map_unit, intensity_units
@@ -249,7 +249,7 @@ class _Planner:
         sensor = self._sensor(zip(self._radars.values(), same_unit, strict=True))
         return dataclasses.replace(
             plan,
-            config=plan.config.override(returns=noise.settings),
+            config=plan.config.override(returns=dict(zip(NOISE_SETTINGS, noise.deviations, strict=True))),
             sensor=dataclasses.replace(sensor, noise=noise),
             radars=tuple(radars),
             tiles=tuple(sorted(tiles, key=lambda tile: tile.tile)),
