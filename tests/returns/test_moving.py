@@ -6,10 +6,10 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.returns.moving import (
-    StaticReturns,
     folding_interval_mps,
     moving_returns,
     sensor_velocity,
+    static_rays,
     without_filler,
 )
 from radarsdf.scans import Scans
@@ -34,8 +34,9 @@ def drive():
     return scans, doppler, moves
 
 
-def static(points, doppler):
-    return StaticReturns.of(points, None, doppler, FitConfig().returns)
+def static(points, doppler, intensities=None):
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    return static_rays(points, poses, intensities, doppler, None, FitConfig(returns={"min_range_m": 0}))
 
 
 def test_moving_returns_are_found(drive):
@@ -46,12 +47,12 @@ def test_moving_returns_are_found(drive):
         found_moving, true = np.concatenate(masks), np.concatenate(moves)
         assert found_moving[true].mean() > 0.99
         assert found_moving[~true].mean() < 0.01
-        assert static(scans.points, [sign * values for values in doppler]).moving == found_moving.sum()
+        assert static(scans.points, [sign * values for values in doppler])[1] == found_moving.sum()
 
 
 def test_a_fit_excludes_and_counts_moving_returns(drive):
     scans, doppler, _ = drive
-    expected = static(scans.points, doppler).moving
+    _, expected, _ = static(scans.points, doppler)
     for given in (
         {"points": Scans(scans.points, scans.poses, scans.intensities, doppler_mps=doppler)},
         {
@@ -84,14 +85,12 @@ def test_half_of_the_scans_must_agree_on_a_velocity(drive):
     # Scans of less than ten returns do not count.
     points = [*scans.points[:11], scans.points[11][:9]]
     assert moving_returns(points, [*doppler[:6], *noise[6:11], doppler[11][:9]])[1] is None
-    lost = static(scans.points, doppler[:5] + noise[5:])
-    assert lost.moving == 0
-    assert lost.why_none == "only 5 of 12 scans agree on a velocity of the sensor"
+    _, *lost = static(scans.points, doppler[:5] + noise[5:])
+    assert lost == [0, "only 5 of 12 scans agree on a velocity of the sensor"]
 
 
 def _too_near(scans, doppler):
-    left = static(scans.points, doppler).points
-    return sum(int((np.linalg.norm(points, axis=1) < 2.5).sum()) for points in left)
+    return int((static(scans.points, doppler)[0].ranges_m < 2.5).sum())
 
 
 def test_inconsistent_doppler_excludes_no_returns(drive):
@@ -101,9 +100,9 @@ def test_inconsistent_doppler_excludes_no_returns(drive):
     # Half of the returns have lost their Doppler, and would all be classified as moving.
     mostly = [np.where(rng.random(len(v)) < 0.5, v, 37.0 + rng.uniform(-20, 20, len(v))) for v in doppler]
     for values, why in ((noise, "scans agree on a velocity"), (mostly, "of the returns disagree")):
-        found = static(scans.points, values)
-        assert found.moving == 0
-        assert why in found.why_none
+        _, moving, why_none = static(scans.points, values)
+        assert moving == 0
+        assert why in why_none
         report = radarsdf.fit(
             scans.points, scans.poses, doppler_mps=values, config=FitConfig(**QUICK), progress=False
         ).report
@@ -112,10 +111,10 @@ def test_inconsistent_doppler_excludes_no_returns(drive):
 
 def test_intensities_stay_with_their_returns(drive):
     scans, doppler, _ = drive
-    found = StaticReturns.of(scans.points, scans.intensities, doppler, FitConfig().returns)
-    kept = [~mask for mask in moving_returns(scans.points, doppler)[0]]
-    for values, all_values, mask in zip(found.intensities, scans.intensities, kept, strict=True):
-        np.testing.assert_array_equal(values, all_values[mask])
+    rays, _, _ = static(scans.points, doppler, scans.intensities)
+    masks, _ = moving_returns(scans.points, doppler)
+    kept = [values[~mask] for values, mask in zip(scans.intensities, masks, strict=True)]
+    np.testing.assert_array_equal(rays.intensities, np.concatenate(kept))
 
 
 @pytest.mark.parametrize("name", ["r0009_0024", "r0057_0068", "r0133_0142", "r0144_0167", "r0309_0320"])

@@ -23,9 +23,9 @@ from radarsdf.map.queries import Deferred, MapContents, evaluate
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale
-from radarsdf.returns.moving import StaticReturns
+from radarsdf.returns.moving import static_rays
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.rays import Rays
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Radars, Sensor
 from radarsdf.returns.sums import ScanSums
@@ -115,14 +115,14 @@ def fit(
         rig, scans, poses_, intensities_, doppler_mps_ = filled(points, **others)
         if rig is not None:
             poses_ = rig.sensor_poses(pose_matrices(poses_, len(rig.of_scan)))
-        static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns, rig)
-        options = config.preparation | {"num_threads": resolve_num_threads(config.num_threads)}
-        rays = prepare(static.points, poses_, static.intensities, origin=origin, rig=rig, **options)
-        rays, radars = Radars.unify(rays, rig, config, options["num_threads"])
+        given = scans, poses_, intensities_, doppler_mps_, rig
+        num_threads = resolve_num_threads(config.num_threads)
+        rays, moving, why_none = static_rays(*given, config, origin=origin, num_threads=num_threads)
+        rays, radars = Radars.unify(rays, rig, config, num_threads)
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
             scale = IntensityScale.between(intensity_range)
-        return FitInput(rays, scale, poses_, static.moving, static.why_none, radars=radars)
+        return FitInput(rays, scale, poses_, moving, why_none, radars=radars)
 
     return fit_rays(read, config, progress=progress, checkpoint=checkpoint)
 

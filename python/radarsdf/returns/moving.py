@@ -7,6 +7,7 @@ RANSAC over draws of three returns gives v, which least squares refines. The met
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +15,6 @@ from numpy.typing import ArrayLike
 from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import one_for_each_scan, values_of_scans
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.config.groups import ReturnsConfig
 from radarsdf.products import normal_matrix, product
 from radarsdf.returns.rays import Rays, check_scans, prepare
 from radarsdf.rig import Rig
@@ -199,41 +199,37 @@ def moving_returns(
     return masks, None
 
 
-@dataclass(frozen=True)
-class StaticReturns:
-    """Returns of F scans without the moving ones that Doppler reveals."""
+def static_rays(
+    points: Iterable[ArrayLike],
+    poses: ArrayLike,
+    intensities: Iterable[ArrayLike] | None,
+    doppler_mps: Sequence[ArrayLike] | None,
+    rig: Rig | None,
+    config: FitConfig,
+    **options: Any,
+) -> tuple[Rays, int, str | None]:
+    """Prepare rays for a fit without :func:`moving_returns`; keep all without Doppler or ``config.returns.drop_moving``.
 
-    points: Iterable[ArrayLike]  # F arrays (N_i, 3), sensor frame, m
-    intensities: Iterable[ArrayLike] | None  # F arrays (N_i,), sensor units
-    moving: int  # number of returns left out
-    why_none: str | None  # why Doppler was not used, in words
-
-    @classmethod
-    def of(
-        cls,
-        points: Iterable[ArrayLike],
-        intensities: Iterable[ArrayLike] | None,
-        doppler_mps: Sequence[ArrayLike] | None,
-        config: ReturnsConfig,
-        rig: Rig | None = None,
-    ) -> "StaticReturns":
-        """Drop :func:`moving_returns`; keep all without Doppler or ``config.drop_moving``."""
-        if doppler_mps is None or not config.drop_moving:
-            return cls(points, intensities, 0, None)
+    Return them, the number of returns left out, and why Doppler was not used, in words. `options`: of :func:`prepare`, before
+    those of `config`; the other arguments are also those of :func:`prepare`.
+    """
+    moving, why_none = 0, None
+    if doppler_mps is not None and config.returns.drop_moving:
         points = list(one_for_each_scan(points, "points"))
         intensities = None if intensities is None else list(one_for_each_scan(intensities, "intensities"))
         check_scans(points, intensities)
         masks, why_none = moving_returns(points, doppler_mps, rig)
+        moving = sum(int(mask.sum()) for mask in masks)
 
         def static(arrays: Sequence[ArrayLike]) -> list[Array]:
             return [np.asarray(array)[~mask] for array, mask in zip(arrays, masks, strict=True)]
 
-        values = None if intensities is None else static(intensities)
-        return cls(static(points), values, sum(int(mask.sum()) for mask in masks), why_none)
+        points, intensities = static(points), None if intensities is None else static(intensities)
+    rays = prepare(points, poses, intensities, rig=rig, **config.preparation | options)
+    return rays, moving, why_none
 
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
     """Return rays of the static returns within the ranges of a fit, without accumulating scans. Intensity outliers are NaN."""
-    static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns, scans.rig)
-    options = config.preparation | {"accumulate_scans": 1, "lattice": None}
-    return prepare(static.points, scans.sensor_poses, static.intensities, rig=scans.rig, **options)
+    given = scans.points, scans.sensor_poses, scans.intensities, scans.doppler_mps, scans.rig
+    return static_rays(*given, config, accumulate_scans=1, lattice=None)[0]

@@ -20,10 +20,10 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
-from radarsdf.returns.moving import StaticReturns
+from radarsdf.returns.moving import static_rays
 from radarsdf.returns.noise import NOISE_SETTINGS, RigNoise, SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
+from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, rays_from
 from radarsdf.returns.sensor import SAME_UNIT, Sensor, Unit, in_map_unit, intensity_units
 from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label
@@ -154,12 +154,10 @@ class _Planner:
 
     def _rays(self, scans: list[Scan], first: int) -> Rays:
         """Prepare the static returns, checked, in a frame of their own."""
-        held, config = scans_in_memory(scans), self._config
+        held = scans_in_memory(scans)
         try:
-            given = held.points, held.intensities, held.doppler_mps
-            static = StaticReturns.of(*given, config.returns, held.rig)
-            options = {"rig": held.rig, "whole": False, **config.preparation}
-            return prepare(static.points, held.poses, static.intensities, **options)
+            given = held.points, held.poses, held.intensities, held.doppler_mps, held.rig
+            return static_rays(*given, self._config, whole=False)[0]
         except (ValueError, TypeError) as error:
             msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
             raise ValueError(msg) from error
