@@ -270,16 +270,13 @@ class _Means:
     def near(self, x: Floats, reach_m: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Weighted mean of values within reach of places (V, 3) (NaN without any), standard error, χ² and degrees of freedom."""
         near = cKDTree(x).sparse_distance_matrix(cKDTree(self.points), reach_m, output_type="coo_matrix")
-
-        def total(values: Floats) -> Floats:
-            return np.bincount(near.row, values[near.col], len(x)).astype(np.float64)
-
+        near.data[:] = 1
         weights = 1 / self.variances
-        weight = total(weights)
+        weight = near @ weights
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = total(weights * self.values) / weight
-            chi2 = total(weights * self.values**2) - weight * mean**2
-            freedom = np.maximum(total(np.ones(len(weights))) - 1, 0)
+            mean = near @ (weights * self.values) / weight
+            chi2 = near @ (weights * self.values**2) - weight * mean**2
+            freedom = np.maximum(near @ np.ones(len(weights)) - 1, 0)
             return mean, 1 / np.sqrt(weight), np.nan_to_num(chi2), freedom
 
 

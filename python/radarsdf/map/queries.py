@@ -63,9 +63,8 @@ class MapContents(WholeMap):
 
     def views_in_world(self) -> ViewStatisticsAt:
         """Return the view statistics in the world frame, in sensor units."""
-        scale = self.intensity_scale
-        low, high = (0.0, 1.0) if scale is None else (scale.low, scale.high)
-        return self.view_statistics().in_world(self.origin, low, high)
+        scale = self.intensity_scale or IntensityScale(0.0, 1.0)
+        return self.view_statistics().in_world(self.origin, scale.low, scale.high)
 
     @cached_property
     def evidence_of_cells(self) -> tuple[CellBlocks, Floats32]:
