@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.poses.agreement import CLEAR, Gain, Verdict, _crowding, _gains, sign_significance
 from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, upright
-from radarsdf.poses.imu import Gyroscope
+from radarsdf.poses.imu import Gyroscope, Inertial
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, way
 from radarsdf.poses.odometry import PosedScans, pose_sigmas
 from radarsdf.poses.planes import SensorReturns, _discount_tilts, apart_m, reduction
@@ -185,7 +185,7 @@ def test_rates_of_a_step_lead_to_the_next_one():
     R, half = before[:3, :3], before[:3, :3] @ rotation(0.5 * turn)
     assert_allclose(turning.covariance, R.T @ covariance[3:, 3:] @ R / duration_s**2)
     assert_allclose(moving.covariance, half.T @ covariance[:3, :3] @ half / duration_s**2)
-    drive = Drive([np.zeros((0, 3))] * 3, np.array([0.0, 0.2, 0.5]), None, None)
+    drive = Drive([np.zeros((0, 3))] * 3, np.array([0.0, 0.2, 0.5]), None)
     next_step = drive.predict(2, turning, moving)
     rate = drive.turns.after(turning, 0.25)
     assert_allclose(next_step.turn.mean, 0.3 * rate.mean)
@@ -236,7 +236,7 @@ def test_standard_deviations_of_poses_become_settings_of_returns():
 def test_motions_of_a_tracked_drive():
     poses = trajectory(5)
     rotation_vectors = np.stack([rotation_vector(step[:3, :3]) for step in between(poses[:-1], poses[1:])])
-    drive = Drive([np.zeros((0, 3))] * 5, 0.5 * np.arange(5.0), None, None)
+    drive = Drive([np.zeros((0, 3))] * 5, 0.5 * np.arange(5.0), None)
     (motion,) = drive.motions(poses, rotation_vectors, slice(0, 5))
     rates = step_vectors(poses) / 0.5
     middle, variance = drive.moves.conditional(rates[:, :3], np.full(4, 0.5))
@@ -250,7 +250,7 @@ def test_motions_of_a_tracked_drive():
     gyroscope = Gyroscope(
         2 * rotation_vectors, np.full(4, 0.5), MotionRate(np.zeros(3), np.diag([1.0, 4, 9]) * 1e-4)
     )
-    with_both = dataclasses.replace(drive, velocities=velocities, gyroscope=gyroscope)
+    with_both = dataclasses.replace(drive, velocities=velocities, inertial=Inertial(gyroscope))
     turning, steady, moving = with_both.motions(poses[1:4], rotation_vectors[1:3], slice(1, 4))
     assert np.isinf(steady.shares).all()
     assert np.isinf(steady.evidence().shares).all()

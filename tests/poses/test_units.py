@@ -71,7 +71,7 @@ def test_the_scale_of_the_doppler_is_estimated(yard, factor):
     speeds = [factor * speeds for speeds in motion.doppler_mps]
     checked = CheckedScans.of(yard.points, speeds, motion.times_s)
     _, yaws = sign_significance(checked.scans, checked.velocities, checked.times_s)
-    drive = Drive(checked.scans, checked.times_s, checked.velocities, None, yaws=yaws)
+    drive = Drive(checked.scans, checked.times_s, checked.velocities, yaws=yaws)
     tests = Consistency.of_returns(drive, FitConfig(num_threads=1), 1)
     assert (tests.contradicted is None) == (factor == 1)
     assert factor == 1 or tests.contradicted.ratio * factor == pytest.approx(1, abs=0.08)
@@ -86,7 +86,7 @@ def test_doppler_of_other_scans_is_excluded(slope, late, named):
     velocities = checked.velocities
     others = velocities.mean_mps[np.clip(np.arange(24) - late, 0, 23)]
     velocities = dataclasses.replace(velocities, mean_mps=others)
-    drive = Drive(checked.scans, checked.times_s, velocities, None)
+    drive = Drive(checked.scans, checked.times_s, velocities)
     tests = Consistency.of_returns(drive, FitConfig(num_threads=1), 1)
     assert tests.delay == late
     unused, (note,) = tests.applied(velocities)

@@ -212,7 +212,7 @@ class Follower:
             return
         fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
         yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
-        drive = Drive(scans, times_s, velocities, None, yaws=yaws)
+        drive = Drive(scans, times_s, velocities, yaws=yaws)
         tested = Consistency.of_returns(drive, self.config, self.config.num_threads)
         trusted, notes = tested.applied(velocities)
         begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
@@ -289,8 +289,8 @@ class Follower:
         durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
         turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
         scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
-        priors = TURNS.learnt(turns, durations_s), MOVES.learnt(moves, durations_s)
-        drive = Drive(scans, times_s, self._velocities(steps, sign), None, *priors, rig=_rig_of(steps))
+        priors = {"turns": TURNS.learnt(turns, durations_s), "moves": MOVES.learnt(moves, durations_s)}
+        drive = Drive(scans, times_s, self._velocities(steps, sign), **priors, rig=_rig_of(steps))
         turn, move = self._rates[-1] if self._rates else (None, None)
         expected = drive.predict(len(steps) - 1, turn, move)
         found = self._tracker.register(drive.scans[-1], expected)
@@ -356,7 +356,7 @@ class Follower:
     def _followed(self, steps: list[Step], sign: int) -> tuple[int, list[Tracked]]:
         """Return the sign of the Doppler, 0 if not significant, and the scans tracked by odometry, in the frame of the first."""
         rig, times_s = _rig_of(steps), np.array([step.time_s for step in steps])
-        drive = Drive([step.scan for step in steps], times_s, None, None, rig=rig)
+        drive = Drive([step.scan for step in steps], times_s, None, rig=rig)
         radars = [np.arange(len(steps))] if rig is None else [*rig.scans_of_radars().values()]
         measured, gains, yaws = [], [], np.full((2, len(steps) - 1), np.nan)
         for rows in radars:

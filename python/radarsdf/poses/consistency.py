@@ -251,7 +251,7 @@ class Consistency:
         free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads)
         yaws = drive.yaws if every == 1 else None
-        tracked, _ = track_once(Drive(scans, times_s, free, None, yaws=yaws), tracker)
+        tracked, _ = track_once(Drive(scans, times_s, free, yaws=yaws), tracker)
         filled = np.array([len(scan) > 0 for scan in scans])
         usable = (np.diff(runs_of(times_s)) == 0) & filled[1:] & filled[:-1]
         if usable.sum() < FEWEST_STEPS:

@@ -201,18 +201,16 @@ class ImuAlignment:
 
     @classmethod
     def of(
-        cls, imu: Imu, velocities: SensorVelocities, times_s: Floats, scan_times_s: Floats | None = None
+        cls, imu: Imu, velocities: SensorVelocities, times_s: Floats, radar: Ints | slice = slice(None)
     ) -> "ImuAlignment | None":
-        """Estimate from velocities at ascending `times_s` (K,). None if it is not observable, or does not explain them.
-
-        `scan_times_s` (F,): times of the scans of all radars, if there are several.
-        """
-        if imu.specific_force is None or len(times_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
+        """Estimate from velocities at `times_s` (F,), those of the scans `radar`. None if it is not observable, or does not explain them."""
+        velocities, own_s = velocities.select(radar), times_s[radar]
+        if imu.specific_force is None or len(own_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
             return None
-        rows, window = _windows(times_s)
-        if len(rows) == 0 or times_s[-1] - times_s[0] < 4 * _UNRELATED_S:
+        rows, window = _windows(own_s)
+        if len(rows) == 0 or own_s[-1] - own_s[0] < 4 * _UNRELATED_S:
             return None
-        model = _AlignmentModel(imu, velocities.select(rows), times_s[rows], window)
+        model = _AlignmentModel(imu, velocities.select(rows), own_s[rows], window)
         if (solved := _solve_linearly(model)) is None:
             return None
         model, x = solved
@@ -227,7 +225,6 @@ class ImuAlignment:
         R, gravity, lever_m, late_s, motion = model.unpack(x)
         if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(late_s) > 2 * _MAX_TIME_OFFSET_S:
             return None
-        times_s = times_s if scan_times_s is None else scan_times_s
         # Against gravity, Qᵀ g in the axes of the IMU.
         up = -np.einsum("ij,fkj,k->fi", R, motion.at(times_s - late_s)[1], gravity)
         up /= np.linalg.norm(up, axis=1, keepdims=True)
@@ -358,7 +355,7 @@ def _minimise(residuals: Callable[[Floats], Floats], x: Floats) -> tuple[Floats,
 class Inertial:
     """The usable measurements of an IMU."""
 
-    gyroscope: Gyroscope | None
+    gyroscope: Gyroscope | None = None
     alignment: ImuAlignment | None = None
     notes: tuple[str, ...] = ()
 
@@ -371,29 +368,36 @@ class Inertial:
         begin_s: float,
         radar: Ints | slice = slice(None),
     ) -> "Inertial":
-        """Build for scans at `times_s` (F,) relative to `begin_s`, in the clock of the IMU. `velocities`: at those of `radar`."""
+        """Build for scans at `times_s` (F,) relative to `begin_s`, in the clock of the IMU, aligned with the scans `radar` of one radar."""
         if imu is None:
-            return cls(None)
+            return cls()
         # Check units first.
         rate = float(np.median(np.linalg.norm(imu.angular_velocity, axis=1)))
-        across = rate * (0.0 if velocities is None else velocities.usual_mps)
+        across = rate * (0.0 if velocities is None else velocities.select(radar).usual_mps)
         if rate > _MOST_RAD_S or across > _MOST_MPS2:
             measured = f"{rate:.3g} rad/s, {across:.0f} m/s² across the trajectory"
-            return cls(None).without(
-                f"the median of its rates is {measured}. They may be in deg/s: give rad/s"
-            )
+            return cls().without(f"the median of its rates is {measured}. They may be in deg/s: give rad/s")
         imu = replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
-            return cls(None).without("it measured before or after all scans. Are both times of one clock?")
+            return cls().without("it measured before or after all scans. Are both times of one clock?")
         if velocities is not None:
-            found = ImuAlignment.of(imu, velocities, times_s[radar], times_s)
+            found = ImuAlignment.of(imu, velocities, times_s, radar)
             if found is not None:
                 return cls(found.gyroscope, found)
         if imu.R_sensor_imu is None:
             why = "as accelerometer and Doppler do not determine it: give R_sensor_imu"
-            return cls(None).without(f"its rotation on the radar is unknown, {why}")
+            return cls().without(f"its rotation on the radar is unknown, {why}")
         rates = np.einsum("ij,gj->gi", imu.R_sensor_imu, imu.angular_velocity)
         return cls(Gyroscope.of(rates, imu.times_s, times_s))
+
+    def learnt(self, turn_rates: Sequence[MotionRate | None]) -> "Inertial":
+        """Estimate the errors of the gyroscope from turn rates, rad/s, or leave it out if they contradict it."""
+        if self.gyroscope is None:
+            return self
+        try:
+            return replace(self, gyroscope=self.gyroscope.learnt(turn_rates))
+        except UnusableGyroscopeError as why:
+            return self.without(why)
 
     def without(self, why: object) -> "Inertial":
         return Inertial(None, notes=(*self.notes, f"The gyroscope is not used: {why}."))

@@ -15,7 +15,7 @@ from radarsdf.poses.agreement import ERRORS, motion_significance
 from radarsdf.poses.checked_scans import CheckedScans, join_radars
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import NOT_USED, BodyVelocities
-from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, level_poses
+from radarsdf.poses.imu import Inertial, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import LEAST_OBSERVED, SensorReturns, Tracked, plane_cell_m
 from radarsdf.poses.refine import JointEstimator, RefinedPoses
@@ -120,10 +120,10 @@ def odometry(
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     with ThreadPool(config.num_threads) as pool:
-        drive, tracked, compared, inertial, scans = track_scans(
+        drive, tracked, compared, scans = track_scans(
             points, doppler_mps, times_s, imu, config, pool.num_threads, progress
         )
-        velocities, notes = drive.velocities, scans.notes
+        velocities, inertial, notes = drive.velocities, drive.inertial, scans.notes
         notes += _check_observed(tracked, drive, notes)
         segments = np.array([found.segment for found in tracked])
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
@@ -136,7 +136,7 @@ def odometry(
         if inertial.alignment is not None:
             poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     length_m = float(lengths_of_steps_m(poses)[np.diff(segments) == 0].sum())
-    gyroscope = drive.gyroscope
+    gyroscope = inertial.gyroscope
     report = {
         "verdict": _summarize(segments, length_m, velocities is not None, inertial),
         "length_m": length_m,
@@ -162,10 +162,10 @@ def track_scans(
     config: FitConfig,
     num_threads: int,
     progress: bool | None,
-) -> tuple[Drive, list[Tracked], list[tuple[CheckedScans, Consistency]], Inertial, CheckedScans]:
+) -> tuple[Drive, list[Tracked], list[tuple[CheckedScans, Consistency]], CheckedScans]:
     """Check scans, compare their Doppler with their returns, and track them. Arguments and errors are those of :func:`odometry`.
 
-    Returns the drive, its tracked scans, the scans of each radar with that comparison, the IMU, and the scans of all radars.
+    Returns the drive, its tracked scans, the scans of each radar with that comparison, and the scans of all radars.
     """
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
     _, _, times_s, imu = filled(points, times_s=times_s, imu=imu)
@@ -178,17 +178,11 @@ def track_scans(
     # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
     of_radars = [each.rows for each, _ in compared if each.velocities is not None]
     radar = max(of_radars, key=len, default=np.arange(len(times)))
-    own = None if velocities is None else velocities.select(radar)
-    inertial = Inertial.of(imu, own, times, scans.begin_s, radar)
-    drive = Drive(scans.scans, times, velocities, inertial.gyroscope, yaws=scans.yaws, rig=rig)
-    try:
-        drive, tracked = track_drive(drive, config, num_threads, progress)
-    except UnusableGyroscopeError as why:
-        inertial = inertial.without(why)
-        drive = replace(drive, gyroscope=None)
-        drive, tracked = track_drive(drive, config, num_threads, progress)
-    scans.notes.extend(inertial.notes)
-    return drive, tracked, compared, inertial, scans
+    inertial = Inertial.of(imu, velocities, times, scans.begin_s, radar)
+    drive = Drive(scans.scans, times, velocities, inertial, yaws=scans.yaws, rig=rig)
+    drive, tracked = track_drive(drive, config, num_threads, progress)
+    scans.notes.extend(drive.inertial.notes)
+    return drive, tracked, compared, scans
 
 
 def _compare(checked: CheckedScans, config: FitConfig, num_threads: int) -> tuple[CheckedScans, Consistency]:
@@ -198,7 +192,7 @@ def _compare(checked: CheckedScans, config: FitConfig, num_threads: int) -> tupl
     checked = replace(checked, scans=scans)
     if checked.velocities is None:
         return checked, Consistency()
-    drive = Drive(scans, checked.times_s, checked.velocities, None, yaws=checked.yaws)
+    drive = Drive(scans, checked.times_s, checked.velocities, yaws=checked.yaws)
     tested = Consistency.of_returns(drive, config, num_threads)
     return tested.corrected(checked), tested
 
@@ -245,7 +239,7 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
         refuse("moved", removed.format(moved, LEAST_OBSERVED), doppler)
     durations_s, velocities = np.diff(drive.times_s), drive.velocities
     measured = isinstance(velocities, BodyVelocities) and velocities.measure_turns(durations_s, least_turned)
-    unknown = not measured and drive.gyroscope is None and turned < least_turned
+    unknown = not measured and drive.inertial.gyroscope is None and turned < least_turned
     if unknown and not drive.turns_slowly:
         refuse("turned", removed.format(turned, least_turned), "a gyroscope (imu)")
     assumed = []

@@ -13,7 +13,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.agreement import YAW_STEP_RAD
 from radarsdf.poses.doppler import BodyVelocities, DopplerMotion, SensorVelocities
-from radarsdf.poses.imu import Gyroscope
+from radarsdf.poses.imu import Inertial
 from radarsdf.poses.motion import (
     Motion,
     MotionPrior,
@@ -177,7 +177,7 @@ class Drive:
     scans: list[Floats]  # (N_i, 3) static returns, frame of the poses, m
     times_s: Floats
     velocities: SensorVelocities | None
-    gyroscope: Gyroscope | None
+    inertial: Inertial = field(default_factory=Inertial)
     turns: MotionPrior = TURNS  # in the sensor frame
     moves: MotionPrior = MOVES
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
@@ -191,8 +191,8 @@ class Drive:
         duration_s = float(self.times_s[i] - self.times_s[i - 1])
         before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
         elapsed_s = (duration_s + before_s) / 2
-        if self.gyroscope is not None:
-            turned = self.gyroscope.step(i - 1)
+        if self.inertial.gyroscope is not None:
+            turned = self.inertial.gyroscope.step(i - 1)
         else:
             turned = self.turns.after(turn, elapsed_s).integrate(duration_s)
             if self.yaws is not None and np.isfinite(yaw := self.yaws[0, i - 1]):
@@ -235,14 +235,15 @@ class Drive:
         times_s = self.times_s[rows]
         duration_s, turn_sigma_rad_s = usual_duration_s(np.diff(times_s)), np.full(3, self.usual_turn_rad_s)
         usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
-        measured = np.repeat([self.velocities is not None, self.gyroscope is not None], 3)
+        gyroscope = self.inertial.gyroscope
+        measured = np.repeat([self.velocities is not None, gyroscope is not None], 3)
         motions: list[Motion] = [SteadyMotion.by(self.steady, usual, times_s, poses, measured)]
-        if self.gyroscope is not None:
+        if gyroscope is not None:
             turned = Motion.of(poses, 0.0, _GYROSCOPE_RAD, times_s)
             turned.shares[:, :3] = np.inf
-            vectors = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
+            vectors = [gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
             turned.steps[:, :3, :3] = rotation(np.stack(vectors))
-            turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
+            turn_sigma_rad_s = np.sqrt(gyroscope.bias.covariance.diagonal())
             motions.insert(0, turned)
         if self.velocities is None:
             return motions
@@ -259,7 +260,7 @@ def track_drive(
     drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
 ) -> tuple[Drive, list[Tracked]]:
     """Track a drive in several passes; return it with its learnt motion prior, and the scans of the last pass."""
-    gyroscope, drive = drive.gyroscope, replace(drive, gyroscope=None)
+    inertial, drive = drive.inertial, replace(drive, inertial=Inertial())
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
@@ -276,9 +277,9 @@ def track_drive(
         drive = replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
         if i == 0 and isinstance(drive.velocities, BodyVelocities):
             drive = replace(drive, velocities=drive.velocities.learnt(turn_rates))
-        if i == 0 and gyroscope is not None:
+        if i == 0:
             # Rotations tracked with the gyroscope would not reveal its bias.
-            drive = replace(drive, gyroscope=gyroscope.learnt(turn_rates))
+            drive = replace(drive, inertial=inertial.learnt(turn_rates))
     return drive, tracked
 
 
