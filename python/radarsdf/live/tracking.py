@@ -213,7 +213,7 @@ class Follower:
         fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
         yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
         drive = Drive(scans, times_s, velocities, yaws=yaws)
-        tested = Consistency.of_returns(drive, self.config, self.config.num_threads)
+        tested = Consistency.of_returns(drive, self.config)
         trusted, notes = tested.applied(velocities)
         begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
         if trusted is None and (other := tested.contradicted) is not None and not other.confirmed:
@@ -267,8 +267,7 @@ class Follower:
                 self._rates.append(rates or self._rates[-1])
         else:
             cell_m = plane_cell_m([step.scan], self.config.leaf_size_m)
-            window = WINDOW * self.num_radars
-            self._tracker = Tracker(cell_m, self.config.returns, self.config.num_threads, window)
+            self._tracker = Tracker(cell_m, self.config, WINDOW * self.num_radars)
         self._steps.append(step)
         if planes:
             self._tracker.add(step.scan, step.found)
@@ -289,8 +288,8 @@ class Follower:
         durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
         turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
         scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
-        priors = {"turns": TURNS.learnt(turns, durations_s), "moves": MOVES.learnt(moves, durations_s)}
-        drive = Drive(scans, times_s, self._velocities(steps, sign), **priors, rig=_rig_of(steps))
+        priors = TURNS.learnt(turns, durations_s), MOVES.learnt(moves, durations_s)
+        drive = Drive(scans, times_s, self._velocities(steps, sign), *priors, rig=_rig_of(steps))
         turn, move = self._rates[-1] if self._rates else (None, None)
         expected = drive.predict(len(steps) - 1, turn, move)
         found = self._tracker.register(drive.scans[-1], expected)
@@ -383,7 +382,7 @@ class Follower:
             signed = [(rows, _signed(found, likelier)) for rows, found in measured]
             velocities = signed[0][1] if rig is None else BodyVelocities.of_radars(rig, signed, times_s)
             drive = dataclasses.replace(drive, velocities=velocities, yaws=known)
-        return sign, track_drive(drive, self.config, self.config.num_threads)[1]
+        return sign, track_drive(drive, self.config)[1]
 
 
 def _rig_of(steps: Sequence[Step]) -> Rig | None:

@@ -9,13 +9,15 @@ from numpy.typing import ArrayLike
 from typing_extensions import Self
 
 from radarsdf.arrays import Floats, Ints
-from radarsdf.checks import MAX_TIME_S, check, real_array, values_of_scans
+from radarsdf.checks import MAX_TIME_S, check, instance, real_array, values_of_scans
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import CLEAR, sign_significance, turns_fast
 from radarsdf.poses.doppler import NOT_USED, BodyVelocities, NoVelocityError, SensorVelocities
 from radarsdf.returns.moving import without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Rig
 from radarsdf.scans import Scans, chosen, filled
+from radarsdf.threads import resolve_num_threads
 
 _Points: TypeAlias = Iterable[ArrayLike] | Scans
 _Doppler: TypeAlias = Sequence[ArrayLike] | None
@@ -24,6 +26,12 @@ _MOST_M = 500.0  # maximum median range, m. Imaging radars reach 300 m
 _INTERVALS_S = 0.002, 20.0  # limits of the median scan interval: 500 Hz, and no overlap of moving scans
 _NO_TIMES = "Doppler needs times: the time of each scan (times_s), s"
 _MOST_REACHES = 10.0  # maximum distance between two scans, median ranges: they do not overlap
+
+
+def checked_settings(config: FitConfig | None) -> FitConfig:
+    """Return settings, by default the usual ones, with the number of threads to use."""
+    config = FitConfig() if config is None else instance(config, FitConfig, "config")
+    return config.override(num_threads=resolve_num_threads(config.num_threads))
 
 
 @dataclass(frozen=True)

@@ -236,7 +236,7 @@ class Consistency:
         return cls(0 if found else delay_of(*every)[0], (), found, clock, (), "the poses")
 
     @classmethod
-    def of_returns(cls, drive: Drive, config: FitConfig, num_threads: int) -> "Consistency":
+    def of_returns(cls, drive: Drive, config: FitConfig) -> "Consistency":
         """Compare scans, tracked with velocities that are hardly known; without enough of them, nothing is known."""
         durations_s, velocities = np.diff(drive.times_s), drive.velocities
         if velocities is None or len(durations_s) < FEWEST_STEPS:
@@ -249,7 +249,7 @@ class Consistency:
         scans = [drive.scans[i] for i in rows]
         free = compared.scaled(1.0, _FREE_SCALE)
         free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
-        tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads)
+        tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config)
         yaws = drive.yaws if every == 1 else None
         tracked, _ = track_once(Drive(scans, times_s, free, yaws=yaws), tracker)
         filled = np.array([len(scan) > 0 for scan in scans])

@@ -12,15 +12,14 @@ import numpy as np
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.checked_scans import CheckedScans, join_radars
+from radarsdf.poses.checked_scans import CheckedScans, checked_settings, join_radars
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.odometry import odometry
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import FIRST_SIGMAS, JointEstimator
 from radarsdf.poses.rigid import aligned
-from radarsdf.poses.search import Lost, SurfaceIndex, search_scans
+from radarsdf.poses.search import Lost, OrientedPoints, SurfaceIndex, search_scans
 from radarsdf.scans import Scans
-from radarsdf.threads import ThreadPool
 
 JOINED, APART, AMBIGUOUS = "joined", "apart", "ambiguous"
 # Agreement with surfaces of another session, at the best place, from which several places are alike; below, none is the same.
@@ -64,29 +63,27 @@ def join(sessions: Sequence[Scans], *, config: FitConfig | None = None) -> Joine
         As :func:`odometry`, and for fewer than two sessions.
     """
     begin = time.perf_counter()
-    config = FitConfig() if config is None else instance(config, FitConfig, "config")
+    config = checked_settings(config)
     check(len(sessions) > 1, f"sessions must be at least two, not {len(sessions)}")
     placed = [_Session.of(session, config) for session in sessions]
     verdicts: dict[tuple[int, int], str] = {}
     transforms: dict[int, Floats] = {0: np.eye(4)}
-    with ThreadPool(config.num_threads) as pool:
-        cells = config.leaf_size_m, pool.num_threads
-        indices = [SurfaceIndex.of_returns(one.returns, one.poses, *cells) for one in placed]
-        found: dict[tuple[int, int], Floats] = {}
-        for i, k in itertools.combinations(range(len(placed)), 2):
-            try:
-                T, _ = search_scans(indices[i], placed[k].returns, placed[k].poses, pool.num_threads)
-                found[i, k], found[k, i] = T, np.linalg.inv(T).astype(np.float64)
-                verdicts[i, k] = JOINED
-            except Lost as lost:
-                verdicts[i, k] = AMBIGUOUS if lost.agreeing > _ALIKE else APART
-        while new := [(i, k) for i, k in found if i in transforms and k not in transforms]:
-            i, k = new[0]
-            transforms[k] = transforms[i] @ found[i, k]
-        together = sorted(transforms)
-        poses = [np.full((len(session), 4, 4), np.nan) for session in sessions]
-        for k, refined in zip(together, _refine(placed, transforms, config, pool.num_threads), strict=True):
-            poses[k][placed[k].rows] = refined
+    found: dict[tuple[int, int], Floats] = {}
+    indices = [one.index(config) for one in placed]
+    for i, k in itertools.combinations(range(len(placed)), 2):
+        try:
+            T, _ = search_scans(indices[i], placed[k].returns, placed[k].poses, config.num_threads)
+            found[i, k], found[k, i] = T, np.linalg.inv(T).astype(np.float64)
+            verdicts[i, k] = JOINED
+        except Lost as lost:
+            verdicts[i, k] = AMBIGUOUS if lost.agreeing > _ALIKE else APART
+    while new := [(i, k) for i, k in found if i in transforms and k not in transforms]:
+        i, k = new[0]
+        transforms[k] = transforms[i] @ found[i, k]
+    together = sorted(transforms)
+    poses = [np.full((len(session), 4, 4), np.nan) for session in sessions]
+    for k, refined in zip(together, _refine(placed, transforms, config), strict=True):
+        poses[k][placed[k].rows] = refined
     words = [f"{len(together)} of {len(sessions)} sessions are in one frame."]
     words += [f"Sessions {i} and {k} are {of}." for (i, k), of in verdicts.items() if of != JOINED]
     report = {"verdict": " ".join(words), "joined": together, "seconds": time.perf_counter() - begin}
@@ -114,10 +111,13 @@ class _Session:
         returns = SensorReturns.of(own, limits.min_range_m, limits.max_range_m, own_rig)
         return cls(rows, own, returns, poses[rows])
 
+    def index(self, config: FitConfig) -> SurfaceIndex:
+        leaf_m, origin = config.leaf_size_m, self.poses[:, :3, 3].mean(axis=0)
+        surface = OrientedPoints.of_returns(self.returns, self.poses, leaf_m, config.num_threads)
+        return SurfaceIndex.of_surface(surface, origin, leaf_m)
 
-def _refine(
-    placed: Sequence[_Session], transforms: dict[int, Floats], config: FitConfig, num_threads: int
-) -> list[Floats]:
+
+def _refine(placed: Sequence[_Session], transforms: dict[int, Floats], config: FitConfig) -> list[Floats]:
     """Refine the poses of the sessions jointly, from common planes and the steps within each, in the world of the first."""
     together = sorted(transforms)
     poses = [np.einsum("ij,fjk->fik", transforms[k], placed[k].poses) for k in together]
@@ -133,8 +133,7 @@ def _refine(
     motion = Motion.of(before, *sigmas)
     motion.shares[begins[1:-1] - 1] = np.inf  # from one session to the next
     cell_m = plane_cell_m([scan for one in sessions for scan in one.scans], config.leaf_size_m)
-    estimator = JointEstimator(returns, [motion], cell_m, config.returns, num_threads)
-    found = estimator.estimate(before, len(before))
+    found = JointEstimator(returns, [motion], cell_m, config).estimate(before, len(before))
     # The first session keeps its frame.
     first = found.poses[: begins[1]]
     whole = aligned(first, poses[0])[0] @ np.linalg.inv(first[0])

@@ -12,6 +12,7 @@ from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.map import Map
+from radarsdf.poses.checked_scans import checked_settings
 from radarsdf.poses.odometry import track_scans
 from radarsdf.poses.planes import PlaneMap, SensorReturns, Tracked, least_certain, plane_cell_m, thin
 from radarsdf.poses.refine import WEAK, JointEstimator
@@ -22,7 +23,6 @@ from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.rig import Imu
 from radarsdf.scans import Scans
-from radarsdf.threads import ThreadPool
 
 # Cells of planes for the last estimate: larger ones bend poles and corners, 4 to 17 cm, not 1 to 6.
 _FINE_CELLS = 0.5
@@ -114,32 +114,29 @@ def locate(
     index = radar_map
     if not isinstance(index, SurfaceIndex):
         index = SurfaceIndex.of(instance(index, Map, "radar_map"))  # type: ignore[type-abstract]
-    config = FitConfig() if config is None else instance(config, FitConfig, "config")
+    config = checked_settings(config)
     start = None if guess is None else check_pose(guess, "guess")
-    with ThreadPool(config.num_threads) as pool:
-        drive, tracked, *_, checked = track_scans(
-            points, doppler_mps, times_s, imu, config, pool.num_threads, progress
-        )
-        count = len(tracked)
-        poses, covariance = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
-        explained, segments = np.full(count, np.nan), np.full(count, -1)
-        why: list[Lost] = []
-        localiser = _Localiser(index, drive, tracked, config, pool.num_threads, checked.notes)
-        of_scans = np.array([found.segment for found in tracked])
-        parts = [np.flatnonzero(of_scans == segment) for segment in range(of_scans[-1] + 1)]
-        while parts:
-            part = parts.pop(0)
-            try:
-                rows, *found = localiser.locate(part, start if part[0] == 0 else None)
-            except Lost as refused:
-                why.append(refused)
-                continue
-            poses[rows], covariance[rows], explained[rows] = found
-            poses[rows, :3, 3] += index.origin
-            segments[rows] = segments.max() + 1
-            # The others do not agree there: the radar may have been moved, or left the map.
-            others = part[part < rows[0]], part[part > rows[-1]]
-            parts = [*(rest for rest in others if len(rest) >= _FEWEST), *parts]
+    drive, tracked, _, checked = track_scans(points, doppler_mps, times_s, imu, config, progress)
+    count = len(tracked)
+    poses, covariance = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
+    explained, segments = np.full(count, np.nan), np.full(count, -1)
+    why: list[Lost] = []
+    localiser = _Localiser(index, drive, tracked, config, checked.notes)
+    of_scans = np.array([found.segment for found in tracked])
+    parts = [np.flatnonzero(of_scans == segment) for segment in range(of_scans[-1] + 1)]
+    while parts:
+        part = parts.pop(0)
+        try:
+            rows, *found = localiser.locate(part, start if part[0] == 0 else None)
+        except Lost as refused:
+            why.append(refused)
+            continue
+        poses[rows], covariance[rows], explained[rows] = found
+        poses[rows, :3, 3] += index.origin
+        segments[rows] = segments.max() + 1
+        # The others do not agree there: the radar may have been moved, or left the map.
+        others = part[part < rows[0]], part[part > rows[-1]]
+        parts = [*(rest for rest in others if len(rest) >= _FEWEST), *parts]
     if segments.max() < 0:
         raise why[0]
     report = {
@@ -170,7 +167,6 @@ class _Localiser:
     drive: Drive
     tracked: list[Tracked]
     config: FitConfig
-    num_threads: int
     notes: list[str]
 
     def locate(self, rows: Ints, guess: Floats | None) -> tuple[Ints, Floats, Floats, Floats]:
@@ -187,8 +183,8 @@ class _Localiser:
         reach_m = float(np.percentile(returns.ranges_m, 99))
         planes = self.index.near(poses[:, :3, 3], 1.5 * reach_m)
         rays = returns.posed(poses)
-        surfels = Surfels.of(rays, self.index.cell_m / LEAVES_PER_SURFEL, self.num_threads)
-        noise = sensor_noise(surfels, rays, limits, self.num_threads)
+        surfels = Surfels.of(rays, self.index.cell_m / LEAVES_PER_SURFEL, self.config.num_threads)
+        noise = sensor_noise(surfels, rays, limits, self.config.num_threads)
         planes.variances = noise.variances
         poses, kept = self._follow(planes, thinned, poses, rows, submap)
         rows, poses, thinned = rows[kept], poses[kept], thinned[kept]
@@ -207,7 +203,7 @@ class _Localiser:
             motions = self.drive.motions(poses, turns, slice(rows[0], rows[-1] + 1))
             returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
             cell_m = plane_cell_m(scans, self.config.leaf_size_m)
-            estimator = JointEstimator(returns, motions, cell_m, limits, self.num_threads)
+            estimator = JointEstimator(returns, motions, cell_m, self.config)
             found = estimator.estimate(poses, len(rows), anchor=anchor)
             poses, covariance = found.poses, found.covariance
         if undecided:
@@ -223,10 +219,10 @@ class _Localiser:
         """
         origin, note, first = transform(np.zeros(3), -self.index.origin), "", None
         if guess is None:
-            T_map_own, submap = search_scans(self.index, returns, poses, self.num_threads)
+            T_map_own, submap = search_scans(self.index, returns, poses, self.config.num_threads)
         else:
             T_map_own, submap = guess @ np.linalg.inv(poses[0]), slice(0, 1)
-            T_map_own, note = search_near(self.index, returns, poses, T_map_own, self.num_threads)
+            T_map_own, note = search_near(self.index, returns, poses, T_map_own, self.config.num_threads)
             self.notes.extend([note] if note else [])
             if (np.abs(increments(guess, T_map_own @ poses[0])) < 3 * _GUESS_SIGMAS).all():
                 first = origin @ guess

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Floats, Ints
-from radarsdf.checks import check, instance
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import ERRORS, motion_significance
-from radarsdf.poses.checked_scans import CheckedScans, join_radars
+from radarsdf.poses.checked_scans import CheckedScans, checked_settings, join_radars
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import NOT_USED, BodyVelocities
 from radarsdf.poses.imu import Inertial, level_poses
@@ -24,7 +24,6 @@ from radarsdf.poses.tracking import LATERAL_MPS2, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.rig import Imu
 from radarsdf.scans import Scans, filled
-from radarsdf.threads import ThreadPool
 
 
 class UnobservedMotionError(ValueError):
@@ -118,23 +117,20 @@ def odometry(
     ((6, 4, 4), 1)
     """
     begin = time.perf_counter()
-    config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    with ThreadPool(config.num_threads) as pool:
-        drive, tracked, compared, scans = track_scans(
-            points, doppler_mps, times_s, imu, config, pool.num_threads, progress
-        )
-        velocities, inertial, notes = drive.velocities, drive.inertial, scans.notes
-        notes += _check_observed(tracked, drive, notes)
-        segments = np.array([found.segment for found in tracked])
-        poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
-        notes += loops
-        if velocities is not None:
-            known = [(each.rows, tested) for each, tested in compared if each.velocities is not None]
-            # Radars of a rig move together: the best known one decides.
-            rows, least = min(known, key=lambda radar: len(radar[1].doubts or ()))
-            covariance = least.widened(rows, poses, covariance, segments, drive)
-        if inertial.alignment is not None:
-            poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
+    config = checked_settings(config)
+    drive, tracked, compared, scans = track_scans(points, doppler_mps, times_s, imu, config, progress)
+    velocities, inertial, notes = drive.velocities, drive.inertial, scans.notes
+    notes += _check_observed(tracked, drive, notes)
+    segments = np.array([found.segment for found in tracked])
+    poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config)
+    notes += loops
+    if velocities is not None:
+        known = [(each.rows, tested) for each, tested in compared if each.velocities is not None]
+        # Radars of a rig move together: the best known one decides.
+        rows, least = min(known, key=lambda radar: len(radar[1].doubts or ()))
+        covariance = least.widened(rows, poses, covariance, segments, drive)
+    if inertial.alignment is not None:
+        poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     length_m = float(lengths_of_steps_m(poses)[np.diff(segments) == 0].sum())
     gyroscope = inertial.gyroscope
     report = {
@@ -160,7 +156,6 @@ def track_scans(
     times_s: ArrayLike | None,
     imu: Imu | None,
     config: FitConfig,
-    num_threads: int,
     progress: bool | None,
 ) -> tuple[Drive, list[Tracked], list[tuple[CheckedScans, Consistency]], CheckedScans]:
     """Check scans, compare their Doppler with their returns, and track them. Arguments and errors are those of :func:`odometry`.
@@ -172,20 +167,20 @@ def track_scans(
     check(times_s is not None, "times_s are missing: the time of each scan, s")
     for checked in radars:
         checked.check_intervals()
-    compared = [_compare(checked.signed(), config, num_threads) for checked in radars]
+    compared = [_compare(checked.signed(), config) for checked in radars]
     scans = join_radars(rig, [each for each, _ in compared])
     times, velocities = scans.times_s, scans.velocities
     # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
     of_radars = [each.rows for each, _ in compared if each.velocities is not None]
     radar = max(of_radars, key=len, default=np.arange(len(times)))
     inertial = Inertial.of(imu, velocities, times, scans.begin_s, radar)
-    drive = Drive(scans.scans, times, velocities, inertial, yaws=scans.yaws, rig=rig)
-    drive, tracked = track_drive(drive, config, num_threads, progress)
+    drive = Drive(scans.scans, times, velocities, inertial=inertial, yaws=scans.yaws, rig=rig)
+    drive, tracked = track_drive(drive, config, progress)
     scans.notes.extend(drive.inertial.notes)
     return drive, tracked, compared, scans
 
 
-def _compare(checked: CheckedScans, config: FitConfig, num_threads: int) -> tuple[CheckedScans, Consistency]:
+def _compare(checked: CheckedScans, config: FitConfig) -> tuple[CheckedScans, Consistency]:
     """Compare the Doppler of a radar with its returns within the ranges of the settings."""
     limits = config.returns
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
@@ -193,12 +188,12 @@ def _compare(checked: CheckedScans, config: FitConfig, num_threads: int) -> tupl
     if checked.velocities is None:
         return checked, Consistency()
     drive = Drive(scans, checked.times_s, checked.velocities, yaws=checked.yaws)
-    tested = Consistency.of_returns(drive, config, num_threads)
+    tested = Consistency.of_returns(drive, config)
     return tested.corrected(checked), tested
 
 
 def _estimate_jointly(
-    drive: Drive, tracked: list[Tracked], segments: Ints, config: FitConfig, num_threads: int
+    drive: Drive, tracked: list[Tracked], segments: Ints, config: FitConfig
 ) -> tuple[Floats, Floats, list[str]]:
     """Jointly estimate poses and covariances of all scans of each segment; return them with notes on open loops."""
     poses, turns = (np.stack([getattr(found, name) for found in tracked]) for name in ("pose", "turn"))
@@ -212,8 +207,7 @@ def _estimate_jointly(
             continue
         motions = drive.motions(poses[rows], turns[rows][1:], rows)
         # Tracked poses are close to the truth: no short windows are needed.
-        estimator = JointEstimator(returns, motions, cell_m, limits, num_threads)
-        found = estimator.estimate_closed(poses[rows], len(poses))
+        found = JointEstimator(returns, motions, cell_m, config).estimate_closed(poses[rows], len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance
         notes += open_loops(returns, found.poses, found.noise, rows.start)
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance, notes

@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from radarsdf.arrays import Bools, Floats
-from radarsdf.checks import hides_bar, instance, usable_poses
+from radarsdf.checks import hides_bar, usable_poses
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.agreement import Verdict
-from radarsdf.poses.checked_scans import CheckedScans, join_radars
+from radarsdf.poses.checked_scans import CheckedScans, checked_settings, join_radars
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import DopplerMotion
 from radarsdf.poses.loops import close_loop, open_loops, visits
@@ -25,7 +24,6 @@ from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut
 from radarsdf.rig import Rig
 from radarsdf.scans import Scans, filled
-from radarsdf.threads import ThreadPool
 
 # Within short windows of scans, the drift is small compared with a cell. The window doubles from stage to stage.
 _FIRST_WINDOW = 8
@@ -67,8 +65,7 @@ class JointEstimator:
     returns: SensorReturns
     motions: Sequence[Motion]
     cell_m: float
-    config: ReturnsConfig
-    num_threads: int
+    config: FitConfig
 
     def estimate(
         self,
@@ -83,18 +80,16 @@ class JointEstimator:
         """
         poses, count, noise, motions = given, len(given), None, list(self.motions)
         plan, finest, spread = _plan(count, first_window), 1, np.zeros(6)
+        limits, num_threads = self.config.returns, self.config.num_threads
         bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
         for rounds, (window, planned) in enumerate(bar, 1):
             cells = max(planned, finest)
             # The noise is estimated every other round: it changes slowly.
             even = rounds % 2 == 0
             grid = window, cells * self.cell_m, noise if even else None
-            planes, noise = common_planes(
-                self.returns, poses, *grid, self.config, self.num_threads, shifted=even
-            )
-            steps, inverse, inverse_below, decrement = planes.solve(
-                *_prior(motions, poses, anchor), _TOLERANCE, _MOST_ITERATIONS, True, self.num_threads
-            )
+            planes, noise = common_planes(self.returns, poses, *grid, limits, num_threads, shifted=even)
+            equations = *_prior(motions, poses, anchor), _TOLERANCE, _MOST_ITERATIONS
+            steps, inverse, inverse_below, decrement = planes.solve(*equations, True, num_threads)
             coarser, spread = spread, np.log(step_variances(poses, inverse, inverse_below)).mean(axis=0)
             if rounds == len(plan) - _MOST_ROUNDS + 1 and (spread - coarser > _COARSER).any():
                 finest = _OF_ALL[-1]
@@ -109,12 +104,12 @@ class JointEstimator:
         diagonal, below, gradient = _prior(evidence, poses, anchor)
         if anchor is None:
             diagonal[count // 2] += _FIXED * np.eye(6)
-        covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, self.num_threads)[1]
+        covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
 
         def solve(more: Floats | float) -> Floats:
             """Solve for increments (F, 6) with `more` added to the gradient."""
             right = gradient + more
-            return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, self.num_threads)[0]
+            return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
 
         covariance = covariance + _by_biases(evidence, poses, solve)
         return PosesEstimate(poses, covariance, motions, noise, rounds)
@@ -126,7 +121,7 @@ class JointEstimator:
         found = self.estimate(given, first_window, progress)
         for visit in visits(self.returns, found.poses):
             planes = PlaneMap(self.cell_m, found.noise.variances)
-            start = close_loop(self.returns, found.poses, visit, planes, self.num_threads)
+            start = close_loop(self.returns, found.poses, visit, planes, self.config.num_threads)
             if start is None:
                 continue
             closed = self.estimate(start, len(start))
@@ -247,7 +242,7 @@ def refine_poses(
     False
     """
     begin = time.perf_counter()
-    config = FitConfig() if config is None else instance(config, FitConfig, "config")
+    config = checked_settings(config)
     poses = filled(points, poses=poses)[2]
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
     given, rigid = usable_poses(poses, sum(len(checked.rows) for checked in radars))
@@ -267,13 +262,11 @@ def refine_poses(
     if velocities is not None:
         motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
-    with ThreadPool(config.num_threads) as pool:
-        held = _hold_out(len(returns), config.seed)
-        used = returns.select(~held)
-        estimator = JointEstimator(used, motions, cell_m, limits, pool.num_threads)
-        found = estimator.estimate_closed(given, progress=progress)
-        verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
-        notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
+    held = _hold_out(len(returns), config.seed)
+    used = returns.select(~held)
+    found = JointEstimator(used, motions, cell_m, config).estimate_closed(given, progress=progress)
+    verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
+    notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
     report |= {
         "verdict": verdict.words,

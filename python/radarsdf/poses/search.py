@@ -123,14 +123,6 @@ class SurfaceIndex:
     origin: Floats  # (3,) m, in the world of the map
 
     @classmethod
-    def of_returns(
-        cls, returns: SensorReturns, poses: Floats, leaf_m: float, num_threads: int
-    ) -> "SurfaceIndex":
-        """Build from the surfels of scans at poses (F, 4, 4)."""
-        surface = OrientedPoints.of_returns(returns, poses, leaf_m, num_threads)
-        return cls.of_surface(surface, poses[:, :3, 3].mean(axis=0), leaf_m)
-
-    @classmethod
     def of_surface(cls, surface: OrientedPoints, origin: Floats, leaf_m: float) -> "SurfaceIndex":
         """Build from a surface in the world of the map, in leaf cells of `leaf_m`."""
         local = dataclasses.replace(surface, points=surface.points - origin)
@@ -245,8 +237,7 @@ class SurfaceIndex:
         _, yaw, x, y = np.array(chosen).T
         o = np.zeros_like(yaw)
         poses = transform(np.column_stack([o, o, yaw]), np.column_stack([x, y, o]))
-        poses[:, :3, 3] -= np.einsum("kij,j->ki", poses[:, :3, :3], submap.centre)
-        return poses
+        return _shifted(poses, -submap.centre)
 
 
 @dataclass(frozen=True)

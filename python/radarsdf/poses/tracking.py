@@ -10,7 +10,6 @@ from tqdm import tqdm
 from radarsdf.arrays import Floats
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.agreement import YAW_STEP_RAD
 from radarsdf.poses.doppler import BodyVelocities, DopplerMotion, SensorVelocities
 from radarsdf.poses.imu import Inertial
@@ -50,8 +49,7 @@ class Tracker:
     """Local map of planes of the last scans, and the last pose."""
 
     cell_size_m: float  # edge of the cell of a map's surfel, m
-    config: ReturnsConfig
-    num_threads: int = 0
+    config: FitConfig
     window: int = WINDOW  # scans in the map
     last: Tracked = field(init=False)
     _planes: PlaneMap = field(init=False)
@@ -101,8 +99,9 @@ class Tracker:
         last = list(self._recent)[-max(2, int(np.searchsorted(counts, _NOISE_RETURNS, side="right"))) :]
         scans, poses, _ = zip(*last, strict=True)
         rays = SensorReturns.of(scans, 0.0, None).posed(np.stack(poses))
-        surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, self.num_threads)
-        return sensor_noise(surfels, rays, self.config, self.num_threads).variances
+        num_threads = self.config.num_threads
+        surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, num_threads)
+        return sensor_noise(surfels, rays, self.config.returns, num_threads).variances
 
     def _dead_reckon(self, predicted: PredictedStep) -> Tracked:
         pose, turn = self.last.pose @ predicted.pose(), predicted.turn.mean
@@ -177,12 +176,12 @@ class Drive:
     scans: list[Floats]  # (N_i, 3) static returns, frame of the poses, m
     times_s: Floats
     velocities: SensorVelocities | None
-    inertial: Inertial = field(default_factory=Inertial)
     turns: MotionPrior = TURNS  # in the sensor frame
     moves: MotionPrior = MOVES
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
     # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
     steady: Priors = MOVES, TURNS
+    inertial: Inertial = field(default_factory=Inertial)
     yaws: Floats | None = None  # as :attr:`CheckedScans.yaws`
     rig: Rig | None = None  # of several radars. The poses are those of its body
 
@@ -257,14 +256,14 @@ Rates = tuple[MotionRate, MotionRate] | tuple[None, None]  # rotation, rad/s, an
 
 
 def track_drive(
-    drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
+    drive: Drive, config: FitConfig, progress: bool | None = False
 ) -> tuple[Drive, list[Tracked]]:
     """Track a drive in several passes; return it with its learnt motion prior, and the scans of the last pass."""
     inertial, drive = drive.inertial, replace(drive, inertial=Inertial())
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
-        tracked, rates = track_once(drive, Tracker(cell_m, config.returns, num_threads, drive.window))
+        tracked, rates = track_once(drive, Tracker(cell_m, config, drive.window))
         turn_rates, move_rates = [turn for turn, _ in rates], [move for _, move in rates]
         turns, moves = drive.turns, drive.moves
         if i == 0 and drive.turns_slowly and tracked[-1].segment > 0:
