@@ -41,7 +41,6 @@ class CheckedScans:
     rows: Ints  # (F,) numbers among the scans of all radars
     scans: list[Floats]  # (N_i, 3) static returns, sensor frame, m
     times_s: Floats  # (F,) relative to the first scan of all radars; numbers of scans if unknown
-    begin_s: float  # time of that scan
     velocities: SensorVelocities | None  # from Doppler. None without Doppler, or if it yields no velocity
     moving: int  # number of moving returns left out
     notes: list[str]  # sentences on unused input
@@ -59,11 +58,10 @@ class CheckedScans:
         far = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
         check(range_m <= _MOST_M, far)
         rows, notes, times_s = np.arange(len(scans)), left_out.notes, _checked_times(times, len(scans))
-        begin_s = float(times_s[0])
-        times_s, repeated = _spread_times(times_s - begin_s)
+        times_s, repeated = _spread_times(times_s - times_s[0])
         if repeated:
             notes = [*notes, f"{repeated} scans repeat the previous time: they are spread evenly."]
-        unused = cls(rows, scans, times_s, begin_s, None, 0, notes)
+        unused = cls(rows, scans, times_s, None, 0, notes)
         if doppler_mps is None or times is None:
             return unused
         speeds, filler = without_filler(scans, values_of_scans(doppler_mps, scans, "doppler_mps"))
@@ -82,7 +80,7 @@ class CheckedScans:
         each = zip(scans, speeds, velocities.of_scans, strict=True)
         static = [x[one.static | np.isnan(mps)] if one.found else x for x, mps, one in each]
         moving = sum(map(len, scans)) - sum(map(len, static))
-        return cls(rows, static, times_s, begin_s, velocities, moving, notes)
+        return cls(rows, static, times_s, velocities, moving, notes)
 
     @classmethod
     def of_radars(
@@ -98,8 +96,8 @@ class CheckedScans:
         times_s, radars = _checked_times(times_, len(given)), []
         for rows in rig.scans_of_radars().values():
             checked = cls.of([given[i] for i in rows], chosen(speeds, rows), times_s[rows])
-            since_s = checked.times_s + (checked.begin_s - times_s[0])
-            radars.append(replace(checked, rows=rows, times_s=since_s, begin_s=float(times_s[0])))
+            since_s = checked.times_s + (times_s[rows[0]] - times_s[0])
+            radars.append(replace(checked, rows=rows, times_s=since_s))
         return rig, radars
 
     def signed(self) -> Self:
@@ -137,7 +135,7 @@ def join_radars(rig: Rig | None, radars: Sequence[CheckedScans]) -> CheckedScans
     velocities = BodyVelocities.of_radars(rig, measured, times_s) if measured else None
     scans, notes = rig.in_body([scans[i] for i in order]), [note for each in radars for note in each.notes]
     moving = sum(each.moving for each in radars)
-    return CheckedScans(rows[order], scans, times_s, radars[0].begin_s, velocities, moving, notes)
+    return CheckedScans(rows[order], scans, times_s, velocities, moving, notes)
 
 
 def _spread_times(times_s: Floats) -> tuple[Floats, int]:

@@ -133,7 +133,7 @@ def _refine(placed: Sequence[_Session], transforms: dict[int, Floats], config: F
     motion = Motion.of(before, *sigmas)
     motion.shares[begins[1:-1] - 1] = np.inf  # from one session to the next
     cell_m = plane_cell_m([scan for one in sessions for scan in one.scans], config.leaf_size_m)
-    found = JointEstimator(returns, [motion], cell_m, config).estimate(before, len(before))
+    found = JointEstimator(returns, [motion], cell_m, config).estimate(before)
     # The first session keeps its frame.
     first = found.poses[: begins[1]]
     whole = aligned(first, poses[0])[0] @ np.linalg.inv(first[0])

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,9 @@ _FEWEST = 6  # scans to search
 _LEAST_AGREEING = 0.75
 _PLACE_RAD = 0.1  # standard deviation of the rotation of a place that was found
 _GUESS_SIGMAS = np.repeat([0.5, 0.05], 3)  # standard deviations of a guess, m and rad
+
+# A scan, its pose (4, 4) as found, and standard deviations (6,) of that.
+_Near: TypeAlias = tuple[int, Floats, Floats]
 
 
 @dataclass(frozen=True)
@@ -194,7 +197,7 @@ class _Localiser:
         near = row, poses[row], np.repeat([planes.capture_m, _PLACE_RAD], 3)
         if first is not None:
             near = 0, first, _GUESS_SIGMAS
-        anchor = _Anchor.of(self.index, noise, thinned, poses, 1.5 * reach_m, near)
+        anchor = self._anchor(noise, thinned, poses, 1.5 * reach_m, near)
         if len(rows) < 2:
             information = anchor(poses)[0] + WEAK * np.eye(6)
             covariance = np.linalg.inv(information).astype(np.float64)
@@ -204,11 +207,13 @@ class _Localiser:
             returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
             cell_m = plane_cell_m(scans, self.config.leaf_size_m)
             estimator = JointEstimator(returns, motions, cell_m, self.config)
-            found = estimator.estimate(poses, len(rows), anchor=anchor)
+            found = estimator.estimate(poses, anchor=anchor)
             poses, covariance = found.poses, found.covariance
-        if undecided:
-            covariance = covariance + _as_guessed(poses)
-        return rows, poses, covariance, anchor.explained(poses)
+        if undecided:  # poses are as uncertain as the guess of the first one
+            J = np.tile(np.eye(6), (len(poses), 1, 1))
+            J[:, :3, 3:] = -skew(poses[:, :3, 3] - poses[0, :3, 3])
+            covariance = covariance + np.einsum("fij,j,fkj->fik", J, _GUESS_SIGMAS**2, J)
+        return rows, poses, covariance, anchor.agreeing(poses) / [max(len(scan), 1) for scan in thinned]
 
     def _place(
         self, returns: SensorReturns, poses: Floats, guess: Floats | None
@@ -264,12 +269,29 @@ class _Localiser:
                 prior = registered.covariance + covariance_in(drift, pose[:3, :3])
         return found, slice(ends[1], ends[0] + 1)
 
-
-def _as_guessed(poses: Floats) -> Floats:
-    """Return the covariances (F, 6, 6) of poses whose place only a guess of the first one tells."""
-    J = np.tile(np.eye(6), (len(poses), 1, 1))
-    J[:, :3, 3:] = -skew(poses[:, :3, 3] - poses[0, :3, 3])
-    return np.einsum("fij,j,fkj->fik", J, _GUESS_SIGMAS**2, J)
+    def _anchor(
+        self, noise: SensorNoise, scans: list[Floats], poses: Floats, reach_m: float, near: _Near
+    ) -> "_Anchor":
+        """Build the anchor of scans (N_i, 3) at about these poses (K, 4, 4), with ranges up to `reach_m`."""
+        planes = self.index.near(poses[:, :3, 3], reach_m, _FINE_CELLS)
+        planes.variances = noise.variances
+        facing, cells = [], []
+        for scan, pose in zip(scans, poses, strict=True):
+            rays = np.einsum("ij,nj->ni", pose[:3, :3], scan)
+            # Thin walls and trunks have two sides, of which the map may show the other one.
+            normals = self.index.surface.normals[self.index.tree.query(rays + pose[:3, 3])[1]]
+            seen = np.einsum("ni,ni->n", rays, normals) < 0
+            facing.append(np.ascontiguousarray(scan[seen]))
+            cells.append(np.floor((rays[seen] + pose[:3, 3]) / (3 * self.index.cell_m)))
+        number = sum(map(len, facing))
+        alike = number / max(len(np.unique(np.concatenate(cells), axis=0)), 1)
+        ranges_m = np.linalg.norm(np.concatenate(facing), axis=1).astype(np.float32)
+        variance_m2 = float(noise.mean_variances_m2(ranges_m).mean()) if number else 1.0
+        weight = 1 / (1 + alike * self.index.surface.thickness_m**2 / variance_m2)
+        axis, chance = planes.information_by_chance(facing, poses)
+        kept = np.eye(6)
+        kept[:3, :3] -= (1 - np.sqrt(1 - chance)) * np.outer(axis, axis)
+        return _Anchor(planes, facing, np.sqrt(weight) * kept, near)
 
 
 @dataclass(frozen=True)
@@ -278,41 +300,9 @@ class _Anchor:
 
     planes: PlaneMap
     scans: list[Floats]  # (N_i, 3) returns on visible sides of surfaces, sensor frame, m
-    numbers: Ints  # (F,) of all returns of these scans
     # (6, 6) square root of the share of information that is kept: returns share the errors of the map, and agree by chance.
     kept: Floats
-    near: tuple[int, Floats, Floats]  # a scan, its pose (4, 4) as found, and standard deviations (6,) of that
-
-    @classmethod
-    def of(
-        cls,
-        index: SurfaceIndex,
-        noise: SensorNoise,
-        scans: list[Floats],
-        poses: Floats,
-        reach_m: float,
-        near: tuple[int, Floats, Floats],
-    ) -> "_Anchor":
-        planes = index.near(poses[:, :3, 3], reach_m, _FINE_CELLS)
-        planes.variances = noise.variances
-        facing, cells = [], []
-        for scan, pose in zip(scans, poses, strict=True):
-            rays = np.einsum("ij,nj->ni", pose[:3, :3], scan)
-            # Thin walls and trunks have two sides, of which the map may show the other one.
-            normals = index.surface.normals[index.tree.query(rays + pose[:3, 3])[1]]
-            seen = np.einsum("ni,ni->n", rays, normals) < 0
-            facing.append(np.ascontiguousarray(scan[seen]))
-            cells.append(np.floor((rays[seen] + pose[:3, 3]) / (3 * index.cell_m)))
-        number = sum(map(len, facing))
-        alike = number / max(len(np.unique(np.concatenate(cells), axis=0)), 1)
-        ranges_m = np.linalg.norm(np.concatenate(facing), axis=1).astype(np.float32)
-        variance_m2 = float(noise.mean_variances_m2(ranges_m).mean()) if number else 1.0
-        weight = 1 / (1 + alike * index.surface.thickness_m**2 / variance_m2)
-        axis, chance = planes.information_by_chance(facing, poses)
-        kept = np.eye(6)
-        kept[:3, :3] -= (1 - np.sqrt(1 - chance)) * np.outer(axis, axis)
-        numbers = np.array([len(scan) for scan in scans])
-        return cls(planes, facing, numbers, np.sqrt(weight) * kept, near)
+    near: _Near
 
     def __call__(self, poses: Floats) -> tuple[Floats, Floats]:
         parts = [self.planes.normal_equations(s, p) for s, p in zip(self.scans, poses, strict=True)]
@@ -324,7 +314,7 @@ class _Anchor:
         gradients[row] += sigmas**-2.0 * increments(pose, poses[row])
         return hessians, gradients
 
-    def explained(self, poses: Floats) -> Floats:
-        """Return the share (F,) of returns that agree with the planes."""
-        agreeing = [self.planes.normal_equations(s, p)[2] for s, p in zip(self.scans, poses, strict=True)]
-        return np.array(agreeing) / np.maximum(self.numbers, 1)
+    def agreeing(self, poses: Floats) -> Floats:
+        """Return the number (F,) of returns of each scan that agree with the planes."""
+        each = zip(self.scans, poses, strict=True)
+        return np.array([self.planes.normal_equations(scan, pose)[2] for scan, pose in each])

@@ -165,15 +165,13 @@ def track_scans(
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
     _, _, times_s, imu = filled(points, times_s=times_s, imu=imu)
     check(times_s is not None, "times_s are missing: the time of each scan, s")
-    for checked in radars:
-        checked.check_intervals()
-    compared = [_compare(checked.signed(), config) for checked in radars]
+    compared = [_compare(checked, config) for checked in radars]
     scans = join_radars(rig, [each for each, _ in compared])
     times, velocities = scans.times_s, scans.velocities
     # An IMU has one lever arm to each radar: it is aligned with the one of the most scans.
     of_radars = [each.rows for each, _ in compared if each.velocities is not None]
     radar = max(of_radars, key=len, default=np.arange(len(times)))
-    inertial = Inertial.of(imu, velocities, times, scans.begin_s, radar)
+    inertial = Inertial.of(imu, velocities, times, float(np.asarray(times_s)[0]), radar)
     drive = Drive(scans.scans, times, velocities, inertial=inertial, yaws=scans.yaws, rig=rig)
     drive, tracked = track_drive(drive, config, progress)
     scans.notes.extend(drive.inertial.notes)
@@ -182,7 +180,8 @@ def track_scans(
 
 def _compare(checked: CheckedScans, config: FitConfig) -> tuple[CheckedScans, Consistency]:
     """Compare the Doppler of a radar with its returns within the ranges of the settings."""
-    limits = config.returns
+    checked.check_intervals()
+    limits, checked = config.returns, checked.signed()
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
     checked = replace(checked, scans=scans)
     if checked.velocities is None:
@@ -206,8 +205,7 @@ def _estimate_jointly(
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(poses[rows], turns[rows][1:], rows)
-        # Tracked poses are close to the truth: no short windows are needed.
-        found = JointEstimator(returns, motions, cell_m, config).estimate_closed(poses[rows], len(poses))
+        found = JointEstimator(returns, motions, cell_m, config).estimate_closed(poses[rows])
         poses[rows], covariance[rows] = found.poses, found.covariance
         notes += open_loops(returns, found.poses, found.noise, rows.start)
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance, notes

@@ -68,18 +68,14 @@ class JointEstimator:
     config: FitConfig
 
     def estimate(
-        self,
-        given: Floats,
-        first_window: int = _FIRST_WINDOW,
-        progress: bool | None = False,
-        anchor: Anchor | None = None,
+        self, given: Floats, *, far: bool = False, progress: bool | None = False, anchor: Anchor | None = None
     ) -> PosesEstimate:
         """Estimate from `given` (F, 4, 4) by the Gauss-Newton method, with new planes in each round.
 
-        Without an anchor, the mean pose is that of `given`, and the covariance relative to the middle scan.
+        Poses that may be `far` from the truth are first estimated in short windows. Without an anchor, the mean pose is that of `given`, and the covariance relative to the middle scan.
         """
         poses, count, noise, motions = given, len(given), None, list(self.motions)
-        plan, finest, spread = _plan(count, first_window), 1, np.zeros(6)
+        plan, finest, spread = _plan(count, _FIRST_WINDOW if far else count), 1, np.zeros(6)
         limits, num_threads = self.config.returns, self.config.num_threads
         bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
         for rounds, (window, planned) in enumerate(bar, 1):
@@ -115,16 +111,16 @@ class JointEstimator:
         return PosesEstimate(poses, covariance, motions, noise, rounds)
 
     def estimate_closed(
-        self, given: Floats, first_window: int = _FIRST_WINDOW, progress: bool | None = False
+        self, given: Floats, *, far: bool = False, progress: bool | None = False
     ) -> PosesEstimate:
         """:meth:`estimate`, and close the loops that are beyond the reach of its planes."""
-        found = self.estimate(given, first_window, progress)
+        found = self.estimate(given, far=far, progress=progress)
         for visit in visits(self.returns, found.poses):
             planes = PlaneMap(self.cell_m, found.noise.variances)
             start = close_loop(self.returns, found.poses, visit, planes, self.config.num_threads)
             if start is None:
                 continue
-            closed = self.estimate(start, len(start))
+            closed = self.estimate(start)
             held = _hold_out(len(self.returns), 0)
             parts = self.returns.select(held), self.returns.select(~held)
             if Verdict.of(*parts, found.poses, closed.poses, closed.noise).closed:
@@ -264,7 +260,7 @@ def refine_poses(
     cell_m = plane_cell_m(scans, config.leaf_size_m)
     held = _hold_out(len(returns), config.seed)
     used = returns.select(~held)
-    found = JointEstimator(used, motions, cell_m, config).estimate_closed(given, progress=progress)
+    found = JointEstimator(used, motions, cell_m, config).estimate_closed(given, far=True, progress=progress)
     verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
     notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()

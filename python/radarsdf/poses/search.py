@@ -178,13 +178,13 @@ class SurfaceIndex:
 
     def outlines(self, points: Floats, margin_m: float) -> Bools:
         """Return a mask (N,) of points (N, 3) that are, seen from above, within the convex outline of the map."""
-        # Unit normals and offsets of the edges; a point is inside where all n · x + offset ≤ 0.
-        edges = self._outline.equations
-        return np.asarray((points[:, :2] @ edges[:, :2].T + edges[:, 2] <= margin_m).all(axis=1))
+        normals, offsets = np.split(self._outline, [2], axis=1)
+        return np.asarray((points[:, :2] @ normals.T + offsets.T <= margin_m).all(axis=1))
 
     @cached_property
-    def _outline(self) -> ConvexHull:
-        return ConvexHull(self.surface.points[:, :2], qhull_options="QJ")
+    def _outline(self) -> Floats:
+        """Unit normals and offsets (E, 3) of the edges; a point is inside where all n · x + offset ≤ 0."""
+        return np.asarray(ConvexHull(self.surface.points[:, :2], qhull_options="QJ").equations)
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -205,7 +205,8 @@ class SurfaceIndex:
         # Cross-correlation of images for all positions at once, by heading (Barnea and Silverman 1972 compare other measures).
         steep = submap.steep
         if not steep.any() or not self.surface.steep.any():
-            return np.zeros((0, 4, 4))
+            msg = "the scans or the map show no steep surface"
+            raise Lost(msg)
         raster, images = self._images
         points, normals = submap.points[steep] - submap.centre, submap.normals[steep]
         pixel_m, radius_m = raster.pixel_m, max(submap.radius_m, raster.pixel_m)
@@ -314,11 +315,7 @@ def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Flo
     of the submap. So no place is found if two are alike, nor if the map does not show the place at all: then the best of many wrong
     poses agrees about as well as the next.
     """
-    starts = index.candidates(submap, num_threads)
-    if len(starts) == 0:
-        msg = "the scans or the map show no steep surface"
-        raise Lost(msg)
-    found = _Places.of(index, submap, starts)
+    found = _Places.of(index, submap, num_threads)
     if (why := found.refusal(found.best)) is not None:
         raise why
     return found.poses_of_frame[found.best]
@@ -335,10 +332,10 @@ def search_near(
     note = "The returns do not confirm the guess: the scans or the map show no steep surface."
     # The guess is that of the first scan, from which poses drift.
     for _, submap in _submaps(index, returns, poses, num_threads, begins=True):
-        starts = index.candidates(submap, num_threads)
-        if len(starts) == 0:
+        try:
+            found = _Places.of(index, submap, num_threads, guess)
+        except Lost:
             continue
-        found = _Places.of(index, submap, starts, guess)
         k = found.best
         if k in found.elsewhere(0) and found.refusal(k) is None:
             at = found.names
@@ -365,11 +362,11 @@ class _Places:
 
     @classmethod
     def of(
-        cls, index: SurfaceIndex, submap: OrientedPoints, starts: Floats, guess: Floats | None = None
+        cls, index: SurfaceIndex, submap: OrientedPoints, num_threads: int, guess: Floats | None = None
     ) -> "_Places":
-        """Register the best of the poses `starts` (K, 4, 4), and the best elsewhere. That of a guess becomes the first."""
+        """Register the best of the candidates, and the best elsewhere. The guess (4, 4) becomes the first place."""
         points = np.random.default_rng(0).permutation(submap.points - submap.centre)[:_REGISTERED]
-        starts = _shifted(starts, submap.centre)
+        starts = _shifted(index.candidates(submap, num_threads), submap.centre)
         given = np.zeros((0, 4, 4)) if guess is None else _shifted(guess[None], submap.centre)
         given[:, :3, 3] -= index.origin
         radius_m = max(submap.radius_m, 1.0)

@@ -91,17 +91,15 @@ class Tracker:
         self._recent.append((scan, found.pose, points))
         self.last = found
         self._scans += 1
-        if self._scans in _NOISE_AT:
-            self._planes.variances = self._estimate_variances()
-
-    def _estimate_variances(self) -> list[float]:
+        if self._scans not in _NOISE_AT:
+            return
         counts = np.cumsum([len(scan) for scan, *_ in reversed(self._recent)])
         last = list(self._recent)[-max(2, int(np.searchsorted(counts, _NOISE_RETURNS, side="right"))) :]
         scans, poses, _ = zip(*last, strict=True)
         rays = SensorReturns.of(scans, 0.0, None).posed(np.stack(poses))
         num_threads = self.config.num_threads
         surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, num_threads)
-        return sensor_noise(surfels, rays, self.config.returns, num_threads).variances
+        self._planes.variances = sensor_noise(surfels, rays, self.config.returns, num_threads).variances
 
     def _dead_reckon(self, predicted: PredictedStep) -> Tracked:
         pose, turn = self.last.pose @ predicted.pose(), predicted.turn.mean
