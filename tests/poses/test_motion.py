@@ -12,10 +12,10 @@ from radarsdf.simulate import drifted
 from .drift import trajectory
 
 
-@pytest.mark.parametrize("times", [None, [0.0, 1, 2, 3, 8, 9]])
+@pytest.mark.parametrize("times", [[0.0, 1, 2, 3, 4, 5], [0.0, 1, 2, 3, 8, 9]])
 def test_the_prior_has_the_derivatives_of_its_cost(times):
     given = trajectory(6)
-    motion = Motion.of(given, 0.1, 0.02, None if times is None else np.array(times))
+    motion = Motion.of(given, 0.1, 0.02, np.array(times))
     motion = dataclasses.replace(motion, bias=np.array([0.01, 0, 0, 0, 0, 0.01]))
     poses = drifted(given, 1e-3, 1e-3, 2)
 
@@ -42,7 +42,7 @@ def test_standard_deviations_and_bias_are_estimated_from_known_poses():
     true = trajectory(400)
     given = drifted(true, 0.03, 0.004, 3, yaw_rad=0.01)
     nothing = np.zeros((400, 6, 6)), np.zeros((399, 6, 6))
-    learnt = Motion.of(given, 0.1, 0.01).learnt(true, true, *nothing)
+    learnt = Motion.of(given, 0.1, 0.01, np.arange(len(given))).learnt(true, true, *nothing)
     assert np.sqrt(learnt.variances[0]) == pytest.approx(0.03, rel=0.1)
     assert np.sqrt(learnt.variances[1]) == pytest.approx(0.004, rel=0.1)
     assert learnt.bias[5] == pytest.approx(-0.01, abs=5e-4)

@@ -49,11 +49,9 @@ class CheckedScans:
     yaws: Floats | None = None
 
     @classmethod
-    def of(cls, points: _Points, doppler_mps: _Doppler, times: ArrayLike | None) -> Self:
+    def of(cls, points: Iterable[ArrayLike], doppler_mps: _Doppler, times: ArrayLike | None) -> Self:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
-        check(doppler_mps is None or times is not None or isinstance(points, Scans), _NO_TIMES)
-        _, given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
-        scans, _, left_out = check_scans(given)
+        scans, _, left_out = check_scans(points)
         range_m = median_range_m(scans)
         far = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
         check(range_m <= _MOST_M, far)
@@ -88,11 +86,12 @@ class CheckedScans:
     ) -> tuple[Rig | None, list[Self]]:
         """:meth:`of` for each radar, and the rig if there are several, whose mountings must be known if `mounted`."""
         rig, given, speeds, times_ = filled(points, doppler_mps=doppler_mps, times_s=times)
-        if rig is None:
-            return None, [cls.of(points, doppler_mps, times)]
-        known = rig.T_body_sensor is not None
+        known = rig is None or rig.T_body_sensor is not None
         check(known or not mounted, "T_body_sensor is missing: the mounting of each radar")
-        check(speeds is None or times_ is not None, _NO_TIMES)
+        unused = rig is None and isinstance(points, Scans)  # of one radar, Doppler without times
+        check(speeds is None or times_ is not None or unused, _NO_TIMES)
+        if rig is None:
+            return None, [cls.of(given, speeds, times_)]
         times_s, radars = _checked_times(times_, len(given)), []
         for rows in rig.scans_of_radars().values():
             checked = cls.of([given[i] for i in rows], chosen(speeds, rows), times_s[rows])

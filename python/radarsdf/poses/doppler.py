@@ -167,7 +167,7 @@ class DopplerMotion(KnownMotion):
         ways = velocities.step_covariances(durations_s)
         shares = np.full((len(durations_s), 6), np.inf)
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
-        spans = spans_of(times_s, len(times_s))
+        spans = spans_of(times_s)
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
         return cls(steps(poses), shares, spans, velocities, durations_s, turns, bias_sigma=common).at(poses)
@@ -280,7 +280,6 @@ class BodyVelocities(SensorVelocities):
         return mean, mean, np.einsum("kfij,kjl->fil", weights, self.levers)
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
-        """Return the covariance (3, 3) of the step from scan `i`, m²."""
         covariance: Floats = self._weights[1][i] * duration_s**2
         clock = 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
         return covariance + clock

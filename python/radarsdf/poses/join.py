@@ -129,8 +129,10 @@ def _refine(placed: Sequence[_Session], transforms: dict[int, Floats], config: F
     parts = [(one.returns.directions, one.returns.ranges_m) for one in sessions]
     directions, ranges_m = (np.concatenate(part) for part in zip(*parts, strict=True))
     returns = SensorReturns(directions, ranges_m, np.concatenate(numbers))
-    sigmas = np.max([FIRST_SIGMAS, *[unsteadiness(one, None) for one in poses]], axis=0).tolist()
-    motion = Motion.of(before, *sigmas)
+    at_s = np.arange(len(before), dtype=np.float64)  # as if they were evenly spaced
+    own = [unsteadiness(one, at_s[: len(one)]) for one in poses]
+    sigma_m, sigma_rad = np.max([FIRST_SIGMAS, *own], axis=0).tolist()
+    motion = Motion.of(before, sigma_m, sigma_rad, at_s)
     motion.shares[begins[1:-1] - 1] = np.inf  # from one session to the next
     cell_m = plane_cell_m([scan for one in sessions for scan in one.scans], config.leaf_size_m)
     found = JointEstimator(returns, [motion], cell_m, config).estimate(before)

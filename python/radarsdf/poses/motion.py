@@ -181,9 +181,9 @@ class Motion:
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
 
     @classmethod
-    def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> "Motion":
-        """Build from poses (F, 4, 4) at `times_s` (F,), or evenly spaced. Step errors accumulate: variances grow with time."""
-        spans = spans_of(times_s, len(poses))
+    def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats) -> "Motion":
+        """Build from poses (F, 4, 4) at `times_s` (F,). Step errors accumulate: variances grow with time."""
+        spans = spans_of(times_s)
         shares = np.repeat(spans[:, None], 6, axis=1)
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
         return cls(steps(poses), shares, spans, variances=variances)
@@ -273,7 +273,7 @@ class SteadyMotion(KnownMotion):
     @classmethod
     def by(cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools) -> Self:
         """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `known` by other sources."""
-        spans = spans_of(times_s, len(times_s))
+        spans = spans_of(times_s)
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
         return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).at(poses)
@@ -295,27 +295,26 @@ class SteadyMotion(KnownMotion):
         return Motion(self.steps, shares, self.spans, variances=self.usual, bias_sigma=self.bias_sigma)
 
 
-def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
+def unsteadiness(poses: Floats, times_s: Floats) -> tuple[float, float]:
     """Return standard deviations of the changes between successive steps of poses (F, 4, 4), treated as noise: m, rad.
 
     Repeated poses, or poses of another clock, have errors as large as the steps: with less, returns would seem outliers.
     """
     if len(poses) < 3:
         return 0.0, 0.0
-    spans = spans_of(times_s, len(poses))
+    spans = spans_of(times_s)
     rates = step_vectors(poses) / spans[:, None]
     squares = np.diff(rates, axis=0) ** 2 / (1 / spans[1:] + 1 / spans[:-1])[:, None]
     sigma_m, sigma_rad = np.sqrt(np.median(squares.reshape(-1, 2, 3).mean(axis=2), axis=0)).tolist()
     return sigma_m, sigma_rad
 
 
-def spans_of(times_s: Floats | None, num_scans: int) -> Floats:
-    """Return durations (F - 1,) of steps relative to the median. Without times, all are 1."""
-    equal = np.ones(num_scans - 1)
-    durations = equal if times_s is None else np.maximum(np.diff(times_s), 0.0)
+def spans_of(times_s: Floats) -> Floats:
+    """Return durations (F - 1,) of steps relative to the median."""
+    durations = np.maximum(np.diff(times_s), 0.0)
     usual_s = usual_duration_s(durations)
     if usual_s == 0:
-        return equal
+        return np.ones(len(durations))
     return np.where(durations > 0, np.maximum(durations / usual_s, _LEAST_SPAN), _AT_ONCE)
 
 

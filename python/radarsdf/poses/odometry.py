@@ -20,7 +20,7 @@ from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import LEAST_OBSERVED, SensorReturns, Tracked, plane_cell_m
 from radarsdf.poses.refine import JointEstimator, RefinedPoses
 from radarsdf.poses.rigid import lengths_of_steps_m, steps
-from radarsdf.poses.tracking import LATERAL_MPS2, Drive, track_drive
+from radarsdf.poses.tracking import LATERAL_MPS2, SLOW_TURN_RAD_S, Drive, track_drive
 from radarsdf.returns.rays import within_ranges
 from radarsdf.rig import Imu
 from radarsdf.scans import Scans, filled
@@ -232,7 +232,7 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
     durations_s, velocities = np.diff(drive.times_s), drive.velocities
     measured = isinstance(velocities, BodyVelocities) and velocities.measure_turns(durations_s, least_turned)
     unknown = not measured and drive.inertial.gyroscope is None and turned < least_turned
-    if unknown and not drive.turns_slowly:
+    if unknown and drive.usual_turn_rad_s >= SLOW_TURN_RAD_S:
         refuse("turned", removed.format(turned, least_turned), "a gyroscope (imu)")
     assumed = []
     if drive.velocities is None:

@@ -1,5 +1,6 @@
 """Refinement of given poses: the joint estimate of all scans, from common planes and measured motion, and its test."""
 
+import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -72,11 +73,15 @@ class JointEstimator:
     ) -> PosesEstimate:
         """Estimate from `given` (F, 4, 4) by the Gauss-Newton method, with new planes in each round.
 
-        Poses that may be `far` from the truth are first estimated in short windows. Without an anchor, the mean pose is that of `given`, and the covariance relative to the middle scan.
+        Poses that may be `far` from the truth are first estimated in short windows. Without an anchor, the mean pose is that of
+        `given`, and the covariance relative to the middle scan.
         """
         poses, count, noise, motions = given, len(given), None, list(self.motions)
-        plan, finest, spread = _plan(count, _FIRST_WINDOW if far else count), 1, np.zeros(6)
-        limits, num_threads = self.config.returns, self.config.num_threads
+        limits, num_threads, finest, spread = self.config.returns, self.config.num_threads, 1, np.zeros(6)
+        doubled = (_FIRST_WINDOW << k for k in itertools.count())
+        short = itertools.takewhile(lambda window: far and window < count, doubled)
+        of_all = *_OF_ALL, *[1] * _MOST_ROUNDS
+        plan = [*itertools.product(short, _OF_WINDOWS), *itertools.product([count], of_all)]
         bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
         for rounds, (window, planned) in enumerate(bar, 1):
             cells = max(planned, finest)
@@ -130,15 +135,6 @@ class JointEstimator:
 
 def _hold_out(count: int, seed: int) -> Bools:
     return np.random.default_rng(seed).random(count) < _HELD_OUT
-
-
-def _plan(num_scans: int, window: int) -> list[tuple[int, int]]:
-    """List windows of scans and cell edges, coarse to fine, from short windows to all scans."""
-    plan = []
-    while window < num_scans:
-        plan += [(window, cells) for cells in _OF_WINDOWS]
-        window *= 2
-    return plan + [(num_scans, cells) for cells in _OF_ALL] + [(num_scans, 1)] * _MOST_ROUNDS
 
 
 def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> tuple[Floats, Floats, Floats]:

@@ -419,7 +419,8 @@ class _Places:
         if (k := self.rival(place)) is not None:
             words = f"two places of the map fit about equally well: {at[place]} and {at[k]}"
             return self.lost(words, place, k)
-        covered = self.covered(place)
+        distances_m, _ = self.index.tree.query(self.points_at(place), distance_upper_bound=self.capture_m)
+        covered = float(np.isfinite(distances_m).mean())
         if covered < _COVERED or len(self.elsewhere(place)) == 0:
             words = f"the map has {covered:.0%} of the surfaces around the best place, {at[place]}, and {_COVERED:.0%} is needed"
             return self.lost(words, place)
@@ -434,11 +435,6 @@ class _Places:
     def points_at(self, place: int) -> Floats:
         pose = self.poses[place]
         return self.points @ pose[:3, :3].T + pose[:3, 3]
-
-    def covered(self, place: int) -> float:
-        """Return the share of the points that have a surface of the map near them."""
-        distances_m, _ = self.index.tree.query(self.points_at(place), distance_upper_bound=self.capture_m)
-        return float(np.isfinite(distances_m).mean())
 
     def rival(self, place: int) -> int | None:
         """Return another place with which the submap does not clearly agree less."""

@@ -84,11 +84,10 @@ class Tracker:
             self._recent.clear()
             self._scans = 0
         points = np.ascontiguousarray(np.einsum("ij,nj->ni", found.pose[:3, :3], scan) + found.pose[:3, 3])
-        oldest = self._recent.popleft() if len(self._recent) == self.window else None
         self._planes.add(points)
-        if oldest is not None:
-            self._planes.add(oldest[2], -1)
         self._recent.append((scan, found.pose, points))
+        if len(self._recent) > self.window:
+            self._planes.add(self._recent.popleft()[2], -1)
         self.last = found
         self._scans += 1
         if self._scans not in _NOISE_AT:
@@ -163,7 +162,7 @@ MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 LATERAL_MPS2 = 2.0
 # Maximum standard deviation of a turn rate that may remain unobserved between scans, that of a sensor faster than 20 m/s: the joint
 # estimate and the covariance are valid for small rotations.
-_SLOW_TURN_RAD_S = 0.1
+SLOW_TURN_RAD_S = 0.1
 _GYROSCOPE_RAD = 0.003  # initial deviation of a step's rotation by a gyroscope
 
 
@@ -223,10 +222,6 @@ class Drive:
         speed_mps = np.sqrt((self.velocities.mean_mps**2).sum(axis=1).mean())
         return min(usual, LATERAL_MPS2 / max(float(speed_mps), 1e-9))
 
-    @property
-    def turns_slowly(self) -> bool:
-        return self.usual_turn_rad_s < _SLOW_TURN_RAD_S
-
     def motions(self, poses: Floats, turns: Floats, rows: slice) -> list[Motion]:
         """Return the measured motions between the K scans of `rows`, with tracked poses (K, 4, 4) and turns (K - 1, 3)."""
         times_s = self.times_s[rows]
@@ -264,7 +259,7 @@ def track_drive(
         tracked, rates = track_once(drive, Tracker(cell_m, config, drive.window))
         turn_rates, move_rates = [turn for turn, _ in rates], [move for _, move in rates]
         turns, moves = drive.turns, drive.moves
-        if i == 0 and drive.turns_slowly and tracked[-1].segment > 0:
+        if i == 0 and drive.usual_turn_rad_s < SLOW_TURN_RAD_S and tracked[-1].segment > 0:
             # Tracking was lost. Narrow the search of the next passes.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turns = MotionPrior(usual, usual, True)
