@@ -26,7 +26,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import Drive, Tracked, rates_of
+from radarsdf.poses.tracking import SLOW_TURN_RAD_S, Drive, Tracked, rates_of
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
 from scipy.stats import t as student
@@ -197,8 +197,8 @@ def test_rates_of_a_step_lead_to_the_next_one():
     assert drive.usual_turn_rad_s == pytest.approx(0.3)
     fast = dataclasses.replace(drive, velocities=velocities_of(np.tile([0, 25.0, 0], (3, 1)), np.eye(3)))
     assert fast.usual_turn_rad_s == pytest.approx(2 / 25)
-    assert fast.turns_slowly
-    assert not drive.turns_slowly
+    assert fast.usual_turn_rad_s < SLOW_TURN_RAD_S
+    assert drive.usual_turn_rad_s >= SLOW_TURN_RAD_S
 
 
 def test_a_gain_is_significant_by_students_t():

@@ -1,6 +1,5 @@
 """Consistency of Doppler and times with the motion that returns, or given poses, show, by window of scans."""
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -54,7 +53,7 @@ def windows_of(count: int) -> Iterator[slice]:
     parts = 1
     while count // parts >= FEWEST_STEPS:
         edges = np.linspace(0, count, parts + 1).astype(int).tolist()
-        yield from (slice(a, b) for a, b in itertools.pairwise(edges))
+        yield from map(slice, edges, edges[1:])
         parts *= 2
 
 
@@ -334,7 +333,8 @@ class Consistency:
 
     def corrected(self, checked: CheckedScans) -> CheckedScans:
         """Return scans with the velocities and times to use, and notes."""
-        assert checked.velocities is not None
+        if checked.velocities is None:
+            return checked
         (velocities, notes), times_s, yaws = self.applied(checked.velocities), checked.times_s, checked.yaws
         if velocities is None:
             yaws = None

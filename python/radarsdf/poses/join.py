@@ -1,10 +1,9 @@
 """Joining of several sessions at one place in one frame (multi-session mapping)."""
 
-import dataclasses
 import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -101,7 +100,7 @@ class _Session:
     def of(cls, session: Scans, config: FitConfig) -> "_Session":
         instance(session, Scans, "a session")
         rig, radars = CheckedScans.of_radars(session, None, None)
-        scans = join_radars(rig, [dataclasses.replace(checked, velocities=None) for checked in radars]).scans
+        scans = join_radars(rig, [replace(checked, velocities=None) for checked in radars]).scans
         poses, rows = session.poses, np.arange(len(session))
         if not np.isfinite(poses).all():
             motion = odometry(session, config=config, progress=False)

@@ -184,8 +184,6 @@ def _compare(checked: CheckedScans, config: FitConfig) -> tuple[CheckedScans, Co
     limits, checked = config.returns, checked.signed()
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
     checked = replace(checked, scans=scans)
-    if checked.velocities is None:
-        return checked, Consistency()
     drive = Drive(scans, checked.times_s, checked.velocities, yaws=checked.yaws)
     tested = Consistency.of_returns(drive, config)
     return tested.corrected(checked), tested

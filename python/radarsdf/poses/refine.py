@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Bools, Floats
+from radarsdf.arrays import Floats
 from radarsdf.checks import hides_bar, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Verdict
@@ -126,15 +126,15 @@ class JointEstimator:
             if start is None:
                 continue
             closed = self.estimate(start)
-            held = _hold_out(len(self.returns), 0)
-            parts = self.returns.select(held), self.returns.select(~held)
-            if Verdict.of(*parts, found.poses, closed.poses, closed.noise).closed:
+            if Verdict.of(*_held_out(self.returns, 0), found.poses, closed.poses, closed.noise).closed:
                 found = replace(closed, poses=aligned(closed.poses, given))
         return found
 
 
-def _hold_out(count: int, seed: int) -> Bools:
-    return np.random.default_rng(seed).random(count) < _HELD_OUT
+def _held_out(returns: SensorReturns, seed: int) -> tuple[SensorReturns, SensorReturns]:
+    """Return the returns that are held out, and the others."""
+    held = np.random.default_rng(seed).random(len(returns)) < _HELD_OUT
+    return returns.select(held), returns.select(~held)
 
 
 def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> tuple[Floats, Floats, Floats]:
@@ -254,10 +254,9 @@ def refine_poses(
     if velocities is not None:
         motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
-    held = _hold_out(len(returns), config.seed)
-    used = returns.select(~held)
+    held, used = _held_out(returns, config.seed)
     found = JointEstimator(used, motions, cell_m, config).estimate_closed(given, far=True, progress=progress)
-    verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
+    verdict = Verdict.of(held, used, given, found.poses, found.noise)
     notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
     report |= {

@@ -1,9 +1,8 @@
 """Search for the place of a submap of several scans in a whole map."""
 
-import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -125,7 +124,7 @@ class SurfaceIndex:
     @classmethod
     def of_surface(cls, surface: OrientedPoints, origin: Floats, leaf_m: float) -> "SurfaceIndex":
         """Build from a surface in the world of the map, in leaf cells of `leaf_m`."""
-        local = dataclasses.replace(surface, points=surface.points - origin)
+        local = replace(surface, points=surface.points - origin)
         return cls(local, LEAVES_PER_SURFEL * leaf_m, origin)
 
     @classmethod
