@@ -42,7 +42,7 @@ def test_standard_deviations_and_bias_are_estimated_from_known_poses():
     true = trajectory(400)
     given = drifted(true, 0.03, 0.004, 3, yaw_rad=0.01)
     nothing = np.zeros((400, 6, 6)), np.zeros((399, 6, 6))
-    learnt = Motion.of(given, 0.1, 0.01, np.arange(len(given))).learnt(true, true, *nothing)
+    learnt = Motion.of(given, 0.1, 0.01, np.arange(len(given))).updated(true, true, *nothing)
     assert np.sqrt(learnt.variances[0]) == pytest.approx(0.03, rel=0.1)
     assert np.sqrt(learnt.variances[1]) == pytest.approx(0.004, rel=0.1)
     assert learnt.bias[5] == pytest.approx(-0.01, abs=5e-4)

@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
-from radarsdf.poses.motion import KnownMotion, MotionRate, interpolate, spans_of, usual_duration_s, way
+from radarsdf.poses.motion import Motion, MotionRate, interpolate, spans_of, usual_duration_s, way
 from radarsdf.poses.rigid import rotation_vector, skew, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import (
@@ -149,8 +149,11 @@ def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
 
 
 @dataclass(frozen=True)
-class DopplerMotion(KnownMotion):
-    """Translations between scans from velocities. They depend on the rotation of the sensor in between."""
+class DopplerMotion(Motion):
+    """Translations between scans from velocities. They depend on the rotation of the sensor in between.
+
+    Their variances are known: learning them made errors of real drives four times larger.
+    """
 
     velocities: SensorVelocities
     durations_s: Floats  # (F - 1,)
@@ -170,9 +173,11 @@ class DopplerMotion(KnownMotion):
         spans = spans_of(times_s)
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
-        return cls(steps(poses), shares, spans, velocities, durations_s, turns, bias_sigma=common).at(poses)
+        return cls(steps(poses), shares, spans, velocities, durations_s, turns, bias_sigma=common).updated(
+            poses
+        )
 
-    def at(self, poses: Floats) -> "DopplerMotion":
+    def updated(self, poses: Floats, *_: Floats) -> "DopplerMotion":
         return self.turned(steps(poses)[:, :3, :3])
 
     def turned(self, rotations: Floats) -> "DopplerMotion":

@@ -380,10 +380,9 @@ class Inertial:
         imu = replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             return cls().without("it measured before or after all scans. Are both times of one clock?")
-        if velocities is not None:
-            found = ImuAlignment.of(imu, velocities, times_s, radar)
-            if found is not None:
-                return cls(found.gyroscope, found)
+        found = None if velocities is None else ImuAlignment.of(imu, velocities, times_s, radar)
+        if found is not None:
+            return cls(found.gyroscope, found)
         if imu.R_sensor_imu is None:
             why = "as accelerometer and Doppler do not determine it: give R_sensor_imu"
             return cls().without(f"its rotation on the radar is unknown, {why}")

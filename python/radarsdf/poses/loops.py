@@ -31,9 +31,7 @@ _PASSES = 3  # of Gauss-Newton, coarse to fine
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
     """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted."""
-    revisited = list(visits(returns, poses))
-    if not revisited:
-        return []
+    revisited = visits(returns, poses)
     returns = returns.every(-(-len(returns) // _MOST_RETURNS))
     points = returns.posed(poses).points.astype(np.float64)
     variances_m2 = noise.mean_variances_m2(returns.ranges_m)

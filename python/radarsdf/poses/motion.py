@@ -188,10 +188,6 @@ class Motion:
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
         return cls(steps(poses), shares, spans, variances=variances)
 
-    def at(self, poses: Floats) -> "Motion":  # noqa: ARG002 - for motions by Doppler
-        """Relinearise at poses (F, 4, 4). Most measurements do not depend on them."""
-        return self
-
     def evidence(self) -> "Motion":
         """Return the part that is independent of the returns, for covariances."""
         return self
@@ -227,7 +223,7 @@ class Motion:
             found[:, scans] -= np.einsum("fki,fk->kfi", jacobian[:, rows], weights[:, rows])
         return found, (weights * self.spans[:, None] * self.bias_sigma).sum(axis=0)[rows]
 
-    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> "Motion":
+    def updated(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> "Motion":
         """Re-estimate bias and variances from `poses`.
 
         Their covariance has blocks `diagonal` (F, 6, 6) and `below` (F - 1, 6, 6), of increments of the poses `before`: at other
@@ -251,15 +247,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class KnownMotion(Motion):
-    """Motions with known variances. Those of velocities are: learning them made errors of real drives four times larger."""
-
-    def learnt(self, *_: Floats) -> Motion:
-        return self
-
-
-@dataclass(frozen=True)
-class SteadyMotion(KnownMotion):
+class SteadyMotion(Motion):
     """Steps predicted by the motion priors, each from its two neighbours.
 
     The posterior density is highest where all steps agree with these predictions. Tracked steps, taken as measurements, keep the
@@ -276,9 +264,11 @@ class SteadyMotion(KnownMotion):
         spans = spans_of(times_s)
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
-        return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).at(poses)
+        return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).updated(
+            poses
+        )
 
-    def at(self, poses: Floats) -> Self:
+    def updated(self, poses: Floats, *_: Floats) -> Self:
         """Predict each step of `poses` from its neighbours."""
         durations_s = self.durations_s
         rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)

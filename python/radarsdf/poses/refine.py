@@ -97,7 +97,7 @@ class JointEstimator:
                 continue
             before, poses = poses, moved(poses, steps)
             poses = aligned(poses, given) if anchor is None else poses
-            motions = [motion.at(poses).learnt(poses, before, inverse, inverse_below) for motion in motions]
+            motions = [motion.updated(poses, before, inverse, inverse_below) for motion in motions]
             if window == count and cells == finest and decrement < _SETTLED**2 * steps.size:
                 break
         assert noise is not None
