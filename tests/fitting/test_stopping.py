@@ -187,7 +187,7 @@ def test_an_interrupted_fit_raises_keyboard_interrupt_without_deferral(scene, mo
     with pytest.raises(Interrupted, match="while training") as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)
     assert caught.value.radar_map.report["iterations_done"] == {"sdf": 0, "intensity": 0}
-    monkeypatch.setattr("radarsdf.fitting.fit.prepare", interrupt)
+    monkeypatch.setattr("radarsdf.fitting.fit.static_rays", interrupt)
     with pytest.raises(Interrupted, match="before the training") as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)
     assert caught.value.radar_map is None
