@@ -351,5 +351,5 @@ def _in_order(rays: Rays, surfels: Surfels, num_threads: int) -> Rays:
     enough = max(_ENOUGH_RETURNS, _ENOUGH_PER_PLANE * int(surfels.is_flat().sum()))
     every = -(-len(rays) // enough)
     # The lower half of the Morton keys, which repeats after 400 m or more, and pseudo-random numbers within each cell.
-    keys = cell_keys(np.ascontiguousarray(rays.points), surfels.cell_size_m, num_threads) << np.uint64(33)
+    keys = cell_keys(rays.points, surfels.cell_size_m, num_threads) << np.uint64(33)
     return rays.select(stable_order(keys | rays.hashes() >> np.uint64(31))[::every])

@@ -106,8 +106,7 @@ def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> Keys:
     steps = math.ceil(2 * band_m / (config.leaf_size_m / 2))
     cells = CellSet(config.leaf_size_m)
     offsets_m = np.linspace(-band_m, band_m, steps + 1).astype(np.float32)
-    points, directions, _ = rays.in_c_order()
-    cells.insert_along(points, directions, offsets_m, num_threads)
+    cells.insert_along(rays.points, rays.directions, offsets_m, num_threads)
     return cells.sorted_keys(num_threads)
 
 

@@ -49,7 +49,7 @@ class Evidence:
         information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
         if visibility is not None:
             return cls(information, hits, visibility.at(leaf_keys))
-        rays_seen = (*rays.in_c_order(), rays.scans)
+        rays_seen = rays.points, rays.directions, rays.ranges_m, rays.scans
         return cls(information, hits, count_visibility(leaf_keys, leaf_size_m, *rays_seen, num_threads))
 
     def columns(self, leaf_keys: Keys, num_threads: int = 0) -> Floats32:

@@ -106,6 +106,4 @@ def first_crossed(
     keys, of_planes = surfels.keys[surfels.cell_of_plane[planes]], np.concatenate(chosen, 1)
     surfel_map = SurfelMap(keys, of_planes.astype(np.float32), surfels.cell_size_m)
     limits = noise.range_m, noise.angle_rad, _MARGIN * surfels.cell_size_m, _SIGMAS
-    points, directions = np.ascontiguousarray(rays.points), np.ascontiguousarray(rays.directions)
-    of_rays = points, directions, np.ascontiguousarray(rays.ranges_m)
-    return surfel_map.first_crossings(*of_rays, *limits, num_threads)
+    return surfel_map.first_crossings(rays.points, rays.directions, rays.ranges_m, *limits, num_threads)

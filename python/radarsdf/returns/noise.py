@@ -214,7 +214,7 @@ def onto_surfels(
     surface, which is that of the returns minus their mean σ². This is the best linear estimate of its true
     distance (Wiener, 1949). Along the plane, the return keeps its position.
     """
-    of_rays = *rays.in_c_order(), np.ascontiguousarray(rays.scans), rays.up_of_scan
+    of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, rays.up_of_scan
     thickness = np.ascontiguousarray(surfels.variances[:, 0])
     planes = surfels.flat_planes_of(cells), surfels.centres, surfels.normals, thickness
     moved_onto = move_onto_planes(*of_rays, *planes, noise.of_scans(rays), kept, num_threads)

@@ -63,8 +63,7 @@ class Surfels:
 
     def cells_at(self, points: Floats32, num_threads: int = 0) -> Ints32:
         """Return the row (N,) of the cell of each of the `points` (N, 3), local, m; -1 for a cell without returns."""
-        keys = cell_keys(np.ascontiguousarray(points), self.cell_size_m, num_threads)
-        return self.blocks.rows(keys, num_threads)
+        return self.blocks.rows(cell_keys(points, self.cell_size_m, num_threads), num_threads)
 
     def cells_of_leaves(self, leaf_keys: Keys, num_threads: int = 0) -> Ints32:
         """Return the row (M,) of the cell that contains each leaf cell with Morton keys (M,); -1 without returns."""

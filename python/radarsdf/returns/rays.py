@@ -32,7 +32,7 @@ _SAME_SQUARE = 1e-6  # relative difference of squares of ranges that are equal b
 class Rays:
     """All returns of a fit, in the local frame: world axes, with `origin` subtracted.
 
-    float32 resolves 0.06 mm at 500 m, but only 0.5 m at UTM coordinates, hence the local frame.
+    float32 resolves 0.06 mm at 500 m, but only 0.5 m at UTM coordinates, hence the local frame. Arrays are in C order.
     """
 
     origin: Floats
@@ -68,9 +68,7 @@ class Rays:
 
     def hashes(self, num_threads: int = 0) -> Keys:
         """Return keys (N,) for samples that do not depend on the order of scans, nor on the origin."""
-        intensities = None if self.intensities is None else np.ascontiguousarray(self.intensities)
-        _, directions, ranges_m = self.in_c_order()
-        return hash_rays(directions, ranges_m, intensities, num_threads)
+        return hash_rays(self.directions, self.ranges_m, self.intensities, num_threads)
 
     def without_outliers(self) -> "Rays":
         if self.intensities is None:
@@ -89,10 +87,6 @@ class Rays:
         else:  # `take` with row indices needs a third of the time of indexing with them or a mask
             columns = {name: column.take(rows, axis=0) for name, column in columns.items()}
         return dataclasses.replace(self, **columns)
-
-    def in_c_order(self) -> tuple[Floats32, Floats32, Floats32]:
-        points, directions = np.ascontiguousarray(self.points), np.ascontiguousarray(self.directions)
-        return points, directions, np.ascontiguousarray(self.ranges_m)
 
     def in_world(self) -> tuple[Floats, Floats]:
         """Return the returns and their sensor positions, (N, 3) each, float64, world, m."""

@@ -277,7 +277,7 @@ class Reflectance:
         """
         flat = np.flatnonzero(surfels.is_flat())
         normals = surfels.normals.astype(np.float32)
-        points, directions, ranges_m = rays.in_c_order()
+        points, directions, ranges_m = rays.points, rays.directions, rays.ranges_m
         plane = surfels.flat_planes_at(points, num_threads)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)

@@ -52,13 +52,12 @@ class ReturnCells:
 
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> "ReturnCells":
-        points = np.ascontiguousarray(rays.points)
         occupied = CellSet(cell_size_m)
-        occupied.insert(points, num_threads)
+        occupied.insert(rays.points, num_threads)
         keys = occupied.sorted_keys(num_threads)
         del occupied  # frees memory: it can be as large as everything below
         blocks = CellBlocks(keys)
-        rows = blocks.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
+        rows = blocks.rows(cell_keys(rays.points, cell_size_m, num_threads), num_threads)
         return cls(keys, blocks, rows)
 
     @cached_property
@@ -97,8 +96,8 @@ class ScanSums:
     ) -> "ScanSums":
         """Sum up `rays` by their `cells`. `weights` (N,): of each return, in parts of 1 / `WEIGHT_UNIT`; None: all are 1."""
         cells = cells or ReturnCells.of(rays, leaf_size_m, num_threads)
-        where = cells.cell_of_ray, cells.keys, leaf_size_m
-        sums = sum_returns(*rays.in_c_order(), *where, num_threads, weights)
+        of_rays = rays.points, rays.directions, rays.ranges_m, cells.cell_of_ray
+        sums = sum_returns(*of_rays, cells.keys, leaf_size_m, num_threads, weights)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         return cls(leaf_size_m, cells.keys, sums, scans, 1 if weights is None else WEIGHT_UNIT)
 
@@ -112,7 +111,7 @@ class ScanSums:
 
         The sums are those of 1; x, y, z, local, m; xx, xy, xz, yy, yz, zz, m²; and the direction (3).
         """
-        keys, moments = merge_sums(self.keys, np.ascontiguousarray(self.sums), self.leaf_size_m)
+        keys, moments = merge_sums(self.keys, self.sums, self.leaf_size_m)
         return keys, moments if self.unit == 1 else moments / self.unit
 
 
@@ -129,7 +128,7 @@ class MeanRays:
 
     @classmethod
     def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> "MeanRays":
-        means = mean_rays(sums.keys, np.ascontiguousarray(sums.sums), sums.leaf_size_m, num_threads)
+        means = mean_rays(sums.keys, sums.sums, sums.leaf_size_m, num_threads)
         points, directions, ranges_m, counts = means
         return cls(sums.keys, points, directions, counts / np.float32(sums.unit), sums.scans, ranges_m)
 

@@ -53,9 +53,8 @@ class FreeSpace:
 
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
         lower, upper = limit if box_cells is None else box_cells.tolist()
-        crossed_m, scans = noise.of_returns(rays, end_m), np.ascontiguousarray(rays.scans)
-        box = leaf_size_m, lower, upper
-        return cls(*find_free_space(*rays.in_c_order(), crossed_m, scans, *box, num_threads))
+        of_rays = rays.points, rays.directions, rays.ranges_m, noise.of_returns(rays, end_m), rays.scans
+        return cls(*find_free_space(*of_rays, leaf_size_m, lower, upper, num_threads))
 
     @classmethod
     def none(cls) -> "FreeSpace":
