@@ -1,7 +1,7 @@
 """Noise of the sensor, estimated from its returns, and noise reduction by moving returns onto planes."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -80,10 +80,6 @@ class SensorNoise:
         """Return :attr:`variances` (F, 3) of the returns of each scan."""
         return np.tile(self.variances, (len(rays.up_of_scan), 1))
 
-    def of_returns(self, rays: Rays, function: "Callable[[SensorNoise, Floats32], Floats32]") -> Floats32:
-        """Return function(noise of the radar, ranges) of each return, (N,)."""
-        return function(self, rays.ranges_m)
-
 
 @dataclass(frozen=True)
 class RigNoise(SensorNoise):
@@ -111,12 +107,6 @@ class RigNoise(SensorNoise):
 
     def of_scans(self, rays: Rays) -> Floats:
         return np.array([own.variances for own in self.of_sensors])[rays.sensor_of_scan]
-
-    def of_returns(self, rays: Rays, function: Callable[[SensorNoise, Floats32], Floats32]) -> Floats32:
-        found = np.empty(len(rays), np.float32)
-        for own, rows in zip(self.of_sensors, rays.rows_of_sensors(), strict=True):
-            found[rows] = function(own, rays.ranges_m[rows])
-        return found
 
 
 def rig_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> RigNoise:

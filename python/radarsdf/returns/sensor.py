@@ -217,22 +217,18 @@ class Radars:
     def unify(
         cls, rays: Rays, rig: Rig | None, config: FitConfig, num_threads: int = 0
     ) -> "tuple[Rays, Radars | None]":
-        """Estimate the radars of a rig, and return `rays` in one unit, and them; of one radar as they are, and None."""
+        """Estimate the radars of a rig. Return `rays` in the unit of the first, and them; of one radar as they are, and None."""
         if rig is None:
             return rays, None
         surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
         noise = rig_noise(surfels, rays, config.returns, num_threads)
-        radars = cls(rig.labels, noise, intensity_units(surfels, rays, num_threads))
-        return radars.in_one_unit(rays), radars
-
-    def in_one_unit(self, rays: Rays) -> Rays:
-        """Return `rays` with the intensities of all radars in the unit of the first. Without a unit they stay."""
-        if rays.intensities is None:
-            return rays
-        values = rays.intensities.copy()
-        for unit, rows in zip(self.units, rays.rows_of_sensors(), strict=True):
-            values[rows] = in_map_unit(values[rows], unit or SAME_UNIT)
-        return dataclasses.replace(rays, intensities=values)
+        units = intensity_units(surfels, rays, num_threads)
+        if rays.intensities is not None:
+            values = rays.intensities.copy()
+            for unit, rows in zip(units, rays.rows_of_sensors(), strict=True):
+                values[rows] = in_map_unit(values[rows], unit or SAME_UNIT)  # without a unit they stay
+            rays = dataclasses.replace(rays, intensities=values)
+        return rays, cls(rig.labels, noise, units)
 
     def sensors(self, rays: Rays, poses: ArrayLike) -> dict[Label, Sensor]:
         """Estimate each radar with returns from `rays` in one unit, of scans with poses (F, 4, 4) T_world_sensor, m."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf._core import cell_rows, find_free_space
 from radarsdf.arrays import AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32, Keys
 from radarsdf.checks import check
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 
@@ -44,16 +44,15 @@ class FreeSpace:
         num_threads: int = 0,
     ) -> "FreeSpace":
         """Compute the crossings of `rays` to true returns in the box [lower, upper), (2, 3) leaf cells; None for no limit."""
-
         # Rays end two standard deviations before the return, and where the angular error exceeds one cell: beyond
         # that, the crossed cell is uncertain.
-        def end_m(own: SensorNoise, ranges_m: Floats32) -> Floats32:
-            before_m = ranges_m - np.float32(_SIGMAS) * np.sqrt(own.variances_m2(ranges_m))
-            return np.minimum(before_m, np.float32(leaf_size_m / own.angle_rad))
-
+        end_m, of_sensors = rays.ranges_m.copy(), noise.of_sensors if isinstance(noise, RigNoise) else [noise]
+        for own, rows in zip(of_sensors, rays.rows_of_sensors(), strict=True):
+            end_m[rows] -= np.float32(_SIGMAS) * np.sqrt(own.variances_m2(rays.ranges_m[rows]))
+            end_m[rows] = np.minimum(end_m[rows], np.float32(leaf_size_m / own.angle_rad))
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
         lower, upper = limit if box_cells is None else box_cells.tolist()
-        of_rays = rays.points, rays.directions, rays.ranges_m, noise.of_returns(rays, end_m), rays.scans
+        of_rays = rays.points, rays.directions, rays.ranges_m, end_m, rays.scans
         return cls(*find_free_space(*of_rays, leaf_size_m, lower, upper, num_threads))
 
     @classmethod
