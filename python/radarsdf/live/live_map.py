@@ -4,7 +4,6 @@ import dataclasses
 import os
 import threading
 import weakref
-from collections import deque
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -133,9 +132,7 @@ class LiveMap:
         mountings = None if T_body_sensor is None else checked_mountings(T_body_sensor)
         self._state = GrowingState(config, corner, most, place, mountings)
         self._follower = Follower(config, num_radars=max(len(mountings or ()), 1))
-        # Last scans since tracking was lost, and their number.
-        self._unplaced: deque[tuple[ScanId | None, LoggedScan]] = deque(maxlen=_MOST_UNPLACED)
-        self._lost = 0
+        self._unplaced: list[tuple[ScanId | None, LoggedScan]] = []  # last scans since tracking was lost
         self._index: tuple[int, SurfaceIndex] | None = None  # of the state of the map of this number
         self._pid = os.getpid()
         self._lock = threading.RLock()  # guards the state
@@ -222,8 +219,7 @@ class LiveMap:
         Without a pose, it is registered with the last scans, near the pose predicted by its Doppler or the motion so far. The
         world is then the frame of the first scan. If it agrees nowhere near, as the first scan after :meth:`load`, it is Lost,
         until every twelfth such scan is found by a search of the whole map, as in :func:`radarsdf.locate`; with it, those before
-        are added. :func:`radarsdf.refine_poses` corrects drift of the poses for
-        :meth:`move_all`.
+        are added. :func:`radarsdf.refine_poses` corrects drift of the poses for :meth:`move_all`.
 
         Parameters
         ----------
@@ -270,20 +266,20 @@ class LiveMap:
         try:
             found = self._integrate(scan, given, scan_id, far)
         except Elsewhere as lost:
+            if len(self._unplaced) == _MOST_UNPLACED:
+                del self._unplaced[:SUBMAP_SCANS]
             self._unplaced.append((scan_id, scan))
-            self._lost += 1
             *earlier, (scan, pose, scan_id) = self._find_again(lost)
             for before, at, before_id in earlier:
                 self._integrate(before, at, before_id, 0)
             found = self._integrate(scan, pose, scan_id, far)
         self._unplaced.clear()
-        self._lost = 0
         return found
 
     def _find_again(self, lost: Lost) -> list[tuple[LoggedScan, Floats, ScanId | None]]:
         """Search the map for the scans since tracking was lost; return them with poses and ids. Raise `lost` until they are found."""
         scans = [scan for _, scan in self._unplaced]
-        if self._lost % SUBMAP_SCANS or len(self) == 0:
+        if len(scans) % SUBMAP_SCANS or len(self) == 0:
             raise lost
         number, times_s = self._state.number, np.array([scan.time_s for scan in scans])
         drive = self._drive(scans, np.full((len(scans), 4, 4), np.nan), times_s=times_s)
