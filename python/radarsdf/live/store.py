@@ -1,6 +1,5 @@
 """Files of a live map: scans and regions moved out of memory, and its saved state."""
 
-import itertools
 import sqlite3
 import weakref
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
@@ -165,12 +164,12 @@ class ScanLog:
     def __contains__(self, scan_id: ScanId) -> bool:
         return scan_id in self._scans or scan_id in self.sealed or self._row(scan_id) is not None
 
-    def _row(self, scan_id: ScanId) -> tuple[int, int, bytes, float | None] | None:
-        """Return number, place in order, pose and time of the row of a scan in the folder; None if there is none."""
+    def _row(self, scan_id: ScanId, *more: str) -> tuple[Any, ...] | None:
+        """Return number, place in order, pose, time and `more` columns of a scan in the folder; None if it is not there."""
         if not self._stored or scan_id in self._scans:
             return None
-        columns = "number, place, pose, time_s FROM scans WHERE id = ? AND number < ?"
-        rows = self._rows.read(columns, scan_id, self._end)
+        columns = ", ".join(["number, place, pose, time_s", *more])
+        rows = self._rows.read(f"{columns} FROM scans WHERE id = ? AND number < ?", scan_id, self._end)
         return next((row for row in rows if row[0] not in self._gone), None)
 
     @property
@@ -199,15 +198,13 @@ class ScanLog:
         """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
         sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
         check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
-        row = self._row(scan_id)
+        row = self._row(scan_id, "radar", *_KINDS)
         if row is None:
             if scan_id not in self._scans:
                 msg = f"the map has no scan {scan_id!r}"
                 raise KeyError(msg)
             return self._scans[scan_id]
-        number, _, pose, time_s = row
-        columns = f"radar, {', '.join(_KINDS)} FROM scans WHERE number = ?"
-        ((radar, *blobs),) = self._rows.read(columns, number)
+        _, _, pose, time_s, radar, *blobs = row
         arrays = [
             None if blob is None else np.frombuffer(blob, chr(blob[0]), offset=1).copy() for blob in blobs
         ]
@@ -385,12 +382,13 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
         ids = [*described.ids, *described.sealed]
         check(len(set(ids)) == len(ids), "ids are duplicated")
         check(described.origin is not None or not ids, "the origin is missing")
-        names = [{f"{name} {i}": name for name in _KINDS} for i in range(len(described.ids))]
-        arrays = arrays_of(path, (*_CELL_COLUMNS, *itertools.chain(*names)))
+        names = [f"{name} {i}" for i in range(len(described.ids)) for name in _KINDS]
+        arrays = arrays_of(path, (*_CELL_COLUMNS, *names))
         scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
-        numbers = described.radars if radars else [0] * len(names)
-        for of_scan, pose, time_s, k in zip(names, described.poses, described.times_s, numbers, strict=True):
-            held: dict[str, Any] = {name: arrays[key] for key, name in of_scan.items() if key in arrays}
+        numbers = described.radars if radars else [0] * len(described.ids)
+        each = zip(described.ids, described.poses, described.times_s, numbers, strict=True)
+        for i, (_, pose, time_s, k) in enumerate(each):
+            held: dict[str, Any] = {name: arrays[key] for name in _KINDS if (key := f"{name} {i}") in arrays}
             points = positions(held["points"], "points")
             for name, array in held.items():
                 if name != "points":
