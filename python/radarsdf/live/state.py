@@ -201,7 +201,6 @@ class GrowingState:
         store.save_state(path, described, scans, self.sums)
 
     def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[Array]) -> None:
-        """Restore a saved state into a new one."""
         self.sums.insert(*sums)
         self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
         self.next_id, self.with_intensities = described.next_id, described.with_intensities

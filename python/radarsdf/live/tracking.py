@@ -67,7 +67,6 @@ class Step:
 
     @property
     def time_s(self) -> float:
-        """Time of the scan, s."""
         assert self.logged.time_s is not None
         return self.logged.time_s
 
@@ -143,21 +142,18 @@ class Follower:
         found = self._start(log, new, sign) or [self._next(new, sign)]
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
-        why, kind = "", Lost
         sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
         sign_open = sign_open and len(self._of_radar(new)) > 1  # other radars see other places
-        if any(step.found.segment for step in found) or (
-            sign_open and found[-1].found.agreeing < _LEAST_AGREEING
-        ):
-            why = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
-            kind = Elsewhere
-        elif not by_doppler and len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED:
-            why = "the returns alone do not observe the motion of the sensor"
-        if why:
+        unlike = sign_open and found[-1].found.agreeing < _LEAST_AGREEING
+        elsewhere = unlike or any(step.found.segment for step in found)
+        unobserved = len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED
+        if elsewhere or (unobserved and not by_doppler):
+            nowhere = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
+            why = nowhere if elsewhere else "the returns alone do not observe the motion of the sensor"
             msg = f"{why}: give its pose, or its Doppler (doppler_mps)"
             if logged.doppler_mps is not None and not by_doppler:
                 msg += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
-            raise kind(msg)
+            raise (Elsewhere if elsewhere else Lost)(msg)
         if (leap_mps := self._leap_mps(new)) is not None:
             msg = f"{NOT_USED}: its velocity changes by {leap_mps:.1f} m/s, far more than before: give the pose of the scan"
             raise Lost(msg)
