@@ -13,7 +13,10 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
+from radarsdf._core import marching_cubes_sparse
+from radarsdf.map.marching_cubes import marching_cubes, sparse_lattice
+
+UNIT = [1.0] * 3, [0.0] * 3, 0.0  # spacing, origin and level
 
 
 def sphere(size):
@@ -147,7 +150,7 @@ def test_sparse_extraction(benchmark, shell, threads):
     radius, given, _ = shell
     _, corners, cells = sparse_lattice(given)
     values = (np.linalg.norm(corners, axis=1) - radius).astype(np.float32)
-    vertices, faces = benchmark(extract_cells, corners, values, cells, num_threads=threads)
+    vertices, faces = benchmark(marching_cubes_sparse, corners, values, cells, *UNIT, threads)
     assert np.abs(np.linalg.norm(vertices, axis=1) - radius).max() < 0.01
     assert len(faces) == {40: 59_857, 200: 1_431_246}[radius]
 
@@ -208,7 +211,7 @@ def test_map_by_cells(benchmark, map_lattice, threads):
 
     def run():
         _, corners, cells = sparse_lattice(map_lattice.cells, num_threads=threads)
-        return extract_cells(corners, map_lattice.values, cells, num_threads=threads)
+        return marching_cubes_sparse(corners, map_lattice.values, cells, *UNIT, threads)
 
     vertices, faces = benchmark(run)
     benchmark.extra_info["distances"] = len(map_lattice.values)

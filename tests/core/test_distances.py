@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from radarsdf import _core
 from radarsdf._core import CellBlocks, CellSet, Encoding, VertexTable, cell_keys, vertex_areas
 from radarsdf.field.field import GridField
-from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.marching_cubes import sparse_lattice
 from scipy.linalg import lstsq
 from scipy.spatial import cKDTree
 
@@ -314,7 +315,7 @@ def expected_surface(field, parts, lowest, highest):
     centres[voxel_corners] = voxels[:, None] + 0.5
     inside = (at + 1e-5 * (centres - at)) * (EDGE_M / parts)  # beyond a face, there may be no cell
     values = field.sdf(torch.from_numpy(inside.astype(np.float32))).detach().numpy()
-    return extract_cells(corners, values, voxel_corners, spacing=[EDGE_M / parts] * 3)
+    return _core.marching_cubes_sparse(corners, values, voxel_corners, [EDGE_M / parts] * 3, [0.0] * 3, 0.0)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 4])

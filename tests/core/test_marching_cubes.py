@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from radarsdf._core import mesh_components
-from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
+from radarsdf._core import marching_cubes_sparse, mesh_components
+from radarsdf.map.marching_cubes import marching_cubes, sparse_lattice
 
 from ..mesh_checks import (
     area,
@@ -86,7 +86,8 @@ def test_dense_and_sparse_equal_the_reference(volume, masked):
     dense = marching_cubes(volume, mask=mask, **placement)
     assert same_mesh(dense, reference_marching_cubes(volume, mask=mask, **placement))
     _, corners, cell_corners = sparse_lattice(np.argwhere(cells_in_use(volume, mask)))
-    sparse = extract_cells(corners, volume[tuple(corners.T)], cell_corners, **placement)
+    placement = {"spacing": [1.0] * 3, "origin": [0.0] * 3, "level": 0.0} | placement
+    sparse = marching_cubes_sparse(corners, volume[tuple(corners.T)], cell_corners, **placement)
     assert same_mesh(dense, sparse)
 
 
@@ -164,7 +165,7 @@ def check(volume, level, mask=None):
         assert all(a.tobytes() == b.tobytes() for a, b in zip(mesh, again, strict=True))
     _, corners, cells = sparse_lattice(np.argwhere(used))
     values = volume[tuple(corners.T)]
-    assert same_mesh(mesh, extract_cells(corners, values, cells, level, num_threads=2))
+    assert same_mesh(mesh, marching_cubes_sparse(corners, values, cells, [1.0] * 3, [0.0] * 3, level, 2))
     return mesh
 
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from radarsdf._core import mesh_components
-from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf._core import marching_cubes_sparse, mesh_components
+from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Threshold
 
@@ -26,9 +26,8 @@ def in_one_go(city, steps, min_triangles):
     inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     _, corners, voxels = sparse_lattice((cells[:, None] * steps + inside).reshape(-1, 3))
     values = city.distances_at(corners.astype(np.int64), voxel_m)
-    vertices, faces = extract_cells(
-        corners, values, voxels, origin=city.config.lattice.position([0, 0, 0]), spacing=[voxel_m] * 3
-    )
+    origin = city.config.lattice.position([0, 0, 0])
+    vertices, faces = marching_cubes_sparse(corners, values, voxels, [voxel_m] * 3, origin, 0.0)
     evidence = city.evidence_at(vertices)
     surface = Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, 0)
     good = surface.confidence >= surface.tally.threshold().min_confidence

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, Encoding, VertexTable, cell_keys
+from radarsdf._core import CellBlocks, Encoding, VertexTable, cell_keys, marching_cubes_sparse
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface_returns import (
@@ -16,7 +16,7 @@ from radarsdf.fitting.surface_returns import (
 )
 from radarsdf.map import queries
 from radarsdf.map.confidence import interpolated
-from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.mesh import Surface
 from radarsdf.map.queries import WholeMap
 from radarsdf.returns import evidence
@@ -177,8 +177,8 @@ class GrowingSurface:
         values = np.zeros(len(corners), np.float32)
         in_order = np.lexsort(cells.T[::-1])  # of the lattice
         values[cell_corners] = rows["values"][crossed][in_order]
-        edges = [leaf_m] * 3
-        vertices, faces = extract_cells(corners, values, cell_corners, spacing=edges, num_threads=num_threads)
+        placement = [leaf_m] * 3, [0.0] * 3, 0.0, num_threads
+        vertices, faces = marching_cubes_sparse(corners, values, cell_corners, *placement)
         of_cells = evidence.Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
         points = queries.to_local(scene, vertices + self._origin)

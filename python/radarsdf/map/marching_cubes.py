@@ -5,7 +5,6 @@ lower one. A vertex lies on an edge between two samples a and b of different sig
 it depends on no other sample. Triangles have no gradient: they change only where a sample changes sign.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from radarsdf import _core
-from radarsdf.arrays import Array, Bools, Floats, Ints32
+from radarsdf.arrays import Array, Bools, Ints32
 from radarsdf.checks import check, real_array, refuse_masked
 
 
@@ -102,22 +101,6 @@ def marching_cubes(
         return _MarchingCubes.apply(samples, *rest)  # type: ignore[no-untyped-call]
     vertices, faces = _core.marching_cubes_dense(samples.detach().numpy(), *rest)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
-
-
-def extract_cells(
-    corners: Array,
-    values: Array,
-    cells: Array,
-    level: float = 0.0,
-    *,
-    spacing: Sequence[float] = (1.0, 1.0, 1.0),
-    origin: Sequence[float] | Floats = (0.0, 0.0, 0.0),
-    num_threads: int = 0,
-) -> tuple[Floats, Ints32]:
-    """Triangulate values (K,) at lattice coordinates (K, 3), in cells (M, 8) of :func:`sparse_lattice`."""
-    corners, cells = (np.ascontiguousarray(a, np.int32) for a in (corners, cells))
-    placement = list(spacing), list(origin), level
-    return _core.marching_cubes_sparse(corners, values, cells, *placement, num_threads)
 
 
 def sparse_lattice(cells: Array, *, num_threads: int = 0) -> tuple[Ints32, Ints32, Ints32]:

@@ -11,13 +11,13 @@ import torch
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import mesh_components, vertex_areas
+from radarsdf._core import marching_cubes_sparse, mesh_components, vertex_areas
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
-from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_mesh
@@ -124,15 +124,15 @@ def extract_triangles(
 ) -> tuple[Floats, Ints32, int]:
     """Triangulate in voxels with centres in the box, local frame, m: vertices (V, 3), faces (F, 3), number of cells searched."""
     config, table, num_threads = contents.config, contents.field.table, torch.get_num_threads()
-    options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": num_threads}
+    placement = [voxel_size] * 3, [0.0] * 3, 0.0, num_threads
     parts, even = per_cell(voxel_size, config.leaf_size_m)
     stored_m = contents.field.corner_distances_m()
     if stored_m is None or not even:
         corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
-        return *extract_cells(corners, distances_m, voxel_corners, **options), searched
+        return *marching_cubes_sparse(corners, distances_m, voxel_corners, *placement), searched
     if parts == 1 and box is None:  # on the corners themselves, in two thirds of the time
         corners, of_cells = table.leaf_vertices(num_threads)
-        return *extract_cells(corners, stored_m, of_cells, **options), len(of_cells)
+        return *marching_cubes_sparse(corners, stored_m, of_cells, *placement), len(of_cells)
     rows = table.cells_near_surface(stored_m, 0.0, num_threads)
     within = np.full((2, 3), [[-np.inf], [np.inf]])  # voxels
     if box is not None:

@@ -13,13 +13,14 @@ import trimesh
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
+from radarsdf._core import marching_cubes_sparse
 from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import AnyPath, check, check_box, hides_bar, path_of, positive
 from radarsdf.io.files import check_outputs, checked_suffix, reading, write_whole
 from radarsdf.io.meshes import MATT, MESH_SUFFIXES, T_GLTF_WORLD, encode_glb, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
-from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.mesh import Surface, crossed, per_cell, renumbered, subdivided
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
@@ -104,9 +105,9 @@ def _surface(city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = N
         centres = position((voxels + 0.5) / steps)
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     _, corners, voxel_corners = sparse_lattice(voxels, num_threads=threads)
-    distances_m, origin = city.distances_at(corners.astype(np.int64), voxel_m), position([0, 0, 0])
-    placement: dict[str, Any] = {"origin": origin, "spacing": [voxel_m] * 3, "num_threads": threads}
-    vertices, faces = extract_cells(corners, distances_m, voxel_corners, **placement)
+    distances_m = city.distances_at(corners.astype(np.int64), voxel_m)
+    placement = [voxel_m] * 3, position([0, 0, 0]).tolist(), 0.0, threads
+    vertices, faces = marching_cubes_sparse(corners, distances_m, voxel_corners, *placement)
     evidence = city.evidence_at(vertices)
     return Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells)), found
 
