@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,6 @@ class GrowingState:
     ) -> None:
         self.config = config
         self.mountings = mountings
-        # With the same cells, returns, bridges, seed and limits.
         names = ("leaf_size_m", "seed", "num_threads", "max_memory_bytes", "returns")
         same = {name: getattr(config, name) for name in names}
         self.quick = FitConfig.quick(**same, encoding={"bridge_cells": config.encoding.bridge_cells})
@@ -149,7 +148,9 @@ class GrowingState:
             blocks, columns = store.read_regions(self.log.folder, regions)
             away = np.setdiff1d(self._away, regions)
             self._commit(partial(self.sums.insert, *columns), blocks, _away=away)
-            store.unlink_regions(self.log.folder, regions)
+            for path in store.region_paths(self.log.folder, regions):
+                with suppress(OSError):  # a leftover file is harmless
+                    path.unlink()
 
     def _put_away(self, regions: Keys) -> Keys:
         blocks, written = store.write_regions(self.log.folder, self.sums, regions)

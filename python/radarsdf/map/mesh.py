@@ -55,7 +55,6 @@ class Surface:
     def from_triangles(
         cls, scene: WholeMap, vertices: Floats, faces: Ints32, evidence: EvidenceAt, cells_searched: int
     ) -> "Surface":
-        """Build from triangles and the evidence at their vertices."""
         found = probabilities(scene, evidence)
         confidence = found.confidence.astype(np.float32)
         columns = confidence.astype(np.float64), found.covering, found.reach, evidence.hits.astype(np.float64)

@@ -65,9 +65,9 @@ class Rays:
         sensors = self.sensor_of_scan.take(self.scans)
         return [np.flatnonzero(sensors == i) for i in range(self.num_sensors)]
 
-    def hashes(self, num_threads: int = 0) -> Keys:
+    def hashes(self) -> Keys:
         """Return keys (N,) for samples that do not depend on the order of scans, nor on the origin."""
-        return hash_rays(self.directions, self.ranges_m, self.intensities, num_threads)
+        return hash_rays(self.directions, self.ranges_m, self.intensities)
 
     def without_outliers(self) -> "Rays":
         if self.intensities is None:
