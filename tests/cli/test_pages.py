@@ -17,7 +17,7 @@ def test_missing_packages_are_named_before_the_work(
     command, scans_file, map_file, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.setattr("radarsdf.fitting.fit.prepare", lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr("radarsdf.fitting.fit.static_rays", lambda *_, **__: pytest.fail("the work began"))
     page = tmp_path / "report.html"
     words = {
         "fit": [scans_file, "-o", tmp_path / "map.safetensors", "--report", page, *FAST],
