@@ -62,3 +62,13 @@ def test_each_scan_needs_the_label_of_its_radar(scans):
         LiveMap(T_body_sensor=scans.T_body_sensor).integrate(scans.points[0], np.eye(4))
     with pytest.raises(ValueError, match="sensor must be one of"):
         LiveMap().integrate(scans.points[0], np.eye(4), sensor="front")
+
+
+def test_scans_of_a_radar_far_from_the_body_are_sealed_beyond_a_ball():
+    """Regression: the reach of returns was measured from the body, and the removal of the scan failed."""
+    T_body_sensor = np.eye(4)
+    T_body_sensor[0, 3] = 5.0
+    live = LiveMap(FitConfig.quick(), T_body_sensor={"front": T_body_sensor})
+    live.integrate(np.tile([10.0, 0, 0], (5, 1)) + 0.1 * np.arange(5)[:, None], np.eye(4), sensor="front")
+    live.clear_outside([0, 0, 0], 12.0)
+    assert live.sealed_scans == 1

@@ -281,7 +281,7 @@ class ScanLog:
         sealed = []
         for scan_id, scan in self._scans.items():
             reach_m = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1).max())
-            if np.linalg.norm(scan.pose[:3, 3] - centre) + reach_m > radius_m:
+            if np.linalg.norm(scan.T_world_sensor[:3, 3] - centre) + reach_m > radius_m:
                 sealed.append(scan_id)
         return self._without(sealed, sealed=True)
 
