@@ -189,13 +189,13 @@ class Follower:
         without = [i for i, step in enumerate(steps) if step.velocity is None or step.given]
         steps = steps[max(without, default=-1) + 1 :][-_JUDGED:]
         count, since = len(steps), sum(step.time_s > judged.time_s for step in steps)
-        if count < _START or since < judged.patience:
+        due = count in (_START, 2 * _START)
+        if count < _START or (since < judged.patience and not due):
             return
         pulls = np.array([step.pull for step in steps if np.isfinite(step.pull)])[-_START:]
         agreeing = np.array([step.found.agreeing for step in steps])
         pulled = len(pulls) == _START and abs(pulls.mean()) > _PULLED + ERRORS * pulls.std() / np.sqrt(_START)
         parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
-        due = count in (_START, 2 * _START)
         if not (due or pulled or parted or judged.doubts):
             return
         # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
