@@ -29,14 +29,8 @@ from radarsdf.io.ros2 import Node, Subscription, _RecentTrack, make_message
 SCENE = ground_and_wall(scans=12, returns_per_scan=600)
 DOMAIN = 100 + os.getpid() % 100
 LIVE = [sys.executable, "-m", "radarsdf", "live", "--ros2", "/radar/points", "--ros2-domain", str(DOMAIN)]
-FAST = [
-    "--set",
-    "training.sdf_iterations=40",
-    "--set",
-    "training.intensity_iterations=20",
-    "--quiet",
-    "--json",
-]
+SETTINGS = "--set training.sdf_iterations=40 --set training.intensity_iterations=20"
+FAST = [*SETTINGS.split(), "--quiet", "--json"]
 TIMEOUT_S = 180
 
 

@@ -29,6 +29,7 @@ from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.odometry import odometry
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, planes_of, unbiased_normals
 from radarsdf.poses.rigid import assembled, increments, moved, rotation, skew, step_vectors
+from radarsdf.returns.ghosts import first_crossed
 from radarsdf.returns.noise import rig_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.rig import Imu, Label, Rig
@@ -51,6 +52,7 @@ _FEWEST = 3  # returns of a radar on a plane that it shares with others
 _IN_COMMON = 10.0
 _SIGMAS2 = 4.0  # squared scale of the Geman-McClure weight
 _SLOW = 0.001  # standard deviation of slowly changing errors of velocities, share of the speed
+_DIFFERENCE = 1e-3  # of numeric derivatives: m, rad, s
 _LEAST_CHANGE = 1e-3  # m/s and rad/s, between knots
 
 
@@ -198,6 +200,9 @@ def _plane_equations(
     rays = radars.returns.posed(poses)
     surfels = Surfels.of(rays, cell_m / LEAVES_PER_SURFEL, num_threads)
     planes = planes_of(rays.points, surfels, num_threads)
+    noise = rig_noise(surfels, rays, config.returns, num_threads)
+    # Ghosts of the ground turned a radar that looks aside over a car park by 0.8 degrees.
+    planes[first_crossed(surfels, np.flatnonzero(surfels.is_flat()), rays, noise, num_threads) >= 0] = -1
     # Of one or two returns of a radar on a plane of another, chance and the cell decide: they turned a simulated radar by 0.8 degrees.
     on = np.flatnonzero(planes >= 0)
     plane, radar = planes[on], radars.of_scan[rays.scans[on]]
@@ -205,15 +210,38 @@ def _plane_equations(
     np.add.at(counts, (plane, radar), 1)
     few = (counts[plane, radar] < _FEWEST) & (np.count_nonzero(counts, axis=1)[plane] > 1)
     planes[on[few]] = -1
-    noise = rig_noise(surfels, rays, config.returns, num_threads).of_scans(rays)
     of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, planes
     of_scans = poses[:, :3, 3] - rays.origin, rays.up_of_scan
     of_planes = surfels.centres, unbiased_normals(surfels, num_threads)
-    common = CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, noise, len(poses), num_threads)
+    of_noise = noise.of_scans(rays)
+    common = CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, of_noise, len(poses), num_threads)
     diagonal, gradient, coupling, scans, first = common.equations
     shape = 3 * (len(first) - 1), 6 * len(poses)
     C = sparse.bsr_matrix((coupling.reshape(-1, 3, 6), scans, first), shape)
     return (_block_diagonal(diagonal.reshape(-1, 6, 6)) - C.T @ C) / _IN_COMMON, gradient / _IN_COMMON
+
+
+def _variances(J: Any, covariance: Floats) -> Floats:
+    """Return the diagonal (N,) of J C Jᵀ for a sparse J (N, U) and covariance C (U, U)."""
+    return np.asarray(J.multiply(J @ covariance).sum(axis=1)).ravel()
+
+
+def _of_path_errors(path: BodyPath, radars: RadarsOfBody, whitening: Any, covariance: Floats) -> Floats:
+    """Return half the expected squares of the errors of velocities caused by those of the path, of covariance (U, U): their first and
+    second derivatives (2, K, 10) by lever arms, rotations and time offsets."""
+    K, count = len(path.mountings), len(covariance)
+
+    def expected(step: Floats) -> Floats:
+        moved_path = path.moved(np.append(np.zeros(count), np.tile(step, K)))
+        J = (whitening @ _sensor_rows(moved_path, radars)[3]).tocsr()[:, :count]
+        of_scans = _variances(J, covariance).reshape(-1, 3).sum(axis=1) / 2
+        return np.bincount(radars.of_scan, of_scans, K).astype(np.float64)
+
+    here, found = expected(np.zeros(_OWN)), np.zeros((2, K, _OWN))
+    for i, step in enumerate(_DIFFERENCE * np.eye(7, _OWN)):
+        above, below = expected(step), expected(-step)
+        found[:, :, i] = (above - below) / (2 * _DIFFERENCE), (above - 2 * here + below) / _DIFFERENCE**2
+    return found
 
 
 def estimate_mountings(
@@ -223,7 +251,7 @@ def estimate_mountings(
     given, num_path, K = path.mountings, _PATH * len(path.positions), len(path.mountings)
     information, num_threads = np.tile(1 / PRIOR**2, (K, 1)), resolve_num_threads(config.num_threads)
     information[radars.reference, :7] = _FIXED
-    # Includes the noise of the first trajectory: an overestimate.
+    # Includes the noise of the first trajectory: an overestimate, until the errors of the path are known.
     spread = np.sqrt((_smooth_rows(path)[1] ** 2).mean(axis=0)) + _LEAST_CHANGE
     for cells in _CELLS:
         # Velocities alone do not observe the turns of the body: at first, its trajectory is kept.
@@ -243,9 +271,21 @@ def estimate_mountings(
         if cells:
             of_planes, gradient = _plane_equations(poses, radars, cells * radars.cell_m, config, num_threads)
             H, g = H + of_poses.T @ of_planes @ of_poses, g + of_poses.T @ gradient
-        solver = splu(H.tocsc())
-        path = path.moved(-solver.solve(g))
-    blocks = solver.solve(np.eye(len(held), K * _OWN, -num_path))[num_path:].reshape(K, _OWN, K, _OWN)
+        observed = H
+        if cells:
+            covariance = splu(H[:num_path, :num_path].tocsc()).solve(np.eye(num_path))
+            of_errors = _variances(changes[:, :num_path], covariance).reshape(-1, 6)
+            spread = np.sqrt((smooth**2 + of_errors).mean(axis=0)) + _LEAST_CHANGE
+        if cells == _CELLS[-1]:
+            # The most probable path is smoother than the true one, which lengthened lever arms by up to 0.4 m. So they are
+            # estimated for all paths that the data leave possible: the marginal likelihood, by the method of Laplace.
+            slope, curvature = _of_path_errors(path, radars, whitening, covariance)
+            g[num_path:] += slope.ravel()
+            H = H + sparse.diags(np.append(np.zeros(num_path), np.maximum(curvature, 0.0)))
+        path = path.moved(-splu(H.tocsc()).solve(g))
+    # Curvature speeds convergence, but observes nothing.
+    of_radars = np.eye(len(held), K * _OWN, -num_path)
+    blocks = splu(observed.tocsc()).solve(of_radars)[num_path:].reshape(K, _OWN, K, _OWN)
     covariance = np.stack([blocks[k, :7, k, :7] for k in range(K)])
     # Errors of velocities that change slowly pass for a delay where the speed changes slowly.
     at_s, apart_s = np.linspace(0.0, radars.times_s[-1], 2 * len(path.positions), retstep=True)
