@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -148,9 +148,7 @@ class GrowingState:
             blocks, columns = store.read_regions(self.log.folder, regions)
             away = np.setdiff1d(self._away, regions)
             self._commit(partial(self.sums.insert, *columns), blocks, _away=away)
-            for path in store.region_paths(self.log.folder, regions):
-                with suppress(OSError):  # a leftover file is harmless
-                    path.unlink()
+            store.unlink_regions(self.log.folder, regions)
 
     def _put_away(self, regions: Keys) -> Keys:
         blocks, written = store.write_regions(self.log.folder, self.sums, regions)

@@ -290,7 +290,7 @@ def _pose_of(blob: bytes) -> Floats:
     return np.frombuffer(blob).reshape(4, 4).copy()
 
 
-def region_paths(folder: Path | None, regions: Keys) -> list[Path]:
+def _region_paths(folder: Path | None, regions: Keys) -> list[Path]:
     """Return the files of regions (R,), which hold their sums bit-identically."""
     return [(folder or Path()) / f"region-{region:016x}.npz" for region in regions.tolist()]
 
@@ -300,7 +300,7 @@ def write_regions(folder: Path | None, sums: GrowingSums, regions: Keys) -> tupl
     blocks = sums.block_keys()
     region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
     written = np.intersect1d(regions, region_of_block)
-    for region, path in zip(written, region_paths(folder, written), strict=True):
+    for region, path in zip(written, _region_paths(folder, written), strict=True):
         _save(path, **arrays_of_sums(sums, blocks[region_of_block == region]))
     return blocks[np.isin(region_of_block, written)], written
 
@@ -308,12 +308,18 @@ def write_regions(folder: Path | None, sums: GrowingSums, regions: Keys) -> tupl
 def read_regions(folder: Path | None, regions: Keys) -> tuple[Keys, list[Array]]:
     """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums."""
     read = []
-    for path in region_paths(folder, regions):
+    for path in _region_paths(folder, regions):
         with reading(path, "a whole region of a live map"):
             read.append(_sums_of(arrays_of(path, _CELL_COLUMNS)))
     columns = [np.concatenate(parts) for parts in zip(*read, strict=True)]
     keys, _, _, visibility_keys, _ = columns
     return np.union1d(visibility_keys, keys >> BLOCK_BITS), columns
+
+
+def unlink_regions(folder: Path | None, regions: Keys) -> None:
+    for path in _region_paths(folder, regions):
+        with suppress(OSError):  # a leftover file is harmless
+            path.unlink()
 
 
 def arrays_of_sums(sums: GrowingSums, blocks: Keys) -> dict[str, Array]:
