@@ -22,7 +22,7 @@ from radarsdf._core import CommonPlanes
 from radarsdf.arrays import Floats, Ints, Ints32
 from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.checked_scans import CheckedScans, checked_settings
 from radarsdf.poses.doppler import LEAST_MPS, SensorVelocities
 from radarsdf.poses.imu import Inertial
 from radarsdf.poses.motion import Motion, unsteadiness
@@ -34,7 +34,6 @@ from radarsdf.returns.noise import rig_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.rig import Imu, Label, Rig
 from radarsdf.scans import Scans, chosen
-from radarsdf.threads import resolve_num_threads
 
 # Unknowns of a knot, and of a radar: lever arm, rotation, time offset, systematic error of its velocities, share of the speed.
 _PATH, _OWN = 6, 10
@@ -194,10 +193,10 @@ def _step_rows(path: BodyPath, steps: Motion, times_s: Floats) -> tuple[Any, Flo
 
 
 def _plane_equations(
-    poses: Floats, radars: RadarsOfBody, cell_m: float, config: FitConfig, num_threads: int
+    poses: Floats, radars: RadarsOfBody, cell_m: float, config: FitConfig
 ) -> tuple[Any, Floats]:
     """Normal equations of increments of the poses (F, 4, 4) of the radars from common planes: (6 F, 6 F), sparse, and (6 F,)."""
-    rays = radars.returns.posed(poses)
+    rays, num_threads = radars.returns.posed(poses), config.num_threads
     surfels = Surfels.of(rays, cell_m / LEAVES_PER_SURFEL, num_threads)
     planes = planes_of(rays.points, surfels, num_threads)
     noise = rig_noise(surfels, rays, config.returns, num_threads)
@@ -249,7 +248,7 @@ def estimate_mountings(
 ) -> tuple[BodyPath, Floats]:
     """Return the estimates and covariances (K, 7, 7) of lever arm, rotation and time offset. `steps`: given ones, at times (F,)."""
     given, num_path, K = path.mountings, _PATH * len(path.positions), len(path.mountings)
-    information, num_threads = np.tile(1 / PRIOR**2, (K, 1)), resolve_num_threads(config.num_threads)
+    information = np.tile(1 / PRIOR**2, (K, 1))
     information[radars.reference, :7] = _FIXED
     # Includes the noise of the first trajectory: an overestimate, until the errors of the path are known.
     spread = np.sqrt((_smooth_rows(path)[1] ** 2).mean(axis=0)) + _LEAST_CHANGE
@@ -269,13 +268,12 @@ def estimate_mountings(
         for J, residual in rows if steps is None else [*rows, _step_rows(path, *steps)]:
             H, g = H + J.T @ J, g + J.T @ residual.ravel()
         if cells:
-            of_planes, gradient = _plane_equations(poses, radars, cells * radars.cell_m, config, num_threads)
+            of_planes, gradient = _plane_equations(poses, radars, cells * radars.cell_m, config)
             H, g = H + of_poses.T @ of_planes @ of_poses, g + of_poses.T @ gradient
-        observed = H
-        if cells:
             covariance = splu(H[:num_path, :num_path].tocsc()).solve(np.eye(num_path))
             of_errors = _variances(changes[:, :num_path], covariance).reshape(-1, 6)
             spread = np.sqrt((smooth**2 + of_errors).mean(axis=0)) + _LEAST_CHANGE
+        observed = H
         if cells == _CELLS[-1]:
             # The most probable path is smoother than the true one, which lengthened lever arms by up to 0.4 m. So they are
             # estimated for all paths that the data leave possible: the marginal likelihood, by the method of Laplace.
@@ -398,7 +396,7 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
         ...
     ValueError: calibrate needs scans of several radars: Scans(..., sensors=labels)
     """
-    config = FitConfig() if config is None else instance(config, FitConfig, "config")
+    config = checked_settings(config)
     rig, limits = instance(scans, Scans, "scans").rig, config.returns
     several = rig is not None and len(np.unique(rig.of_scan)) > 1
     check(several, "calibrate needs scans of several radars: Scans(..., sensors=labels)")

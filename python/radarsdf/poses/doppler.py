@@ -173,9 +173,8 @@ class DopplerMotion(Motion):
         spans = spans_of(times_s)
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)
-        return cls(steps(poses), shares, spans, velocities, durations_s, turns, bias_sigma=common).updated(
-            poses
-        )
+        motion = cls(steps(poses), shares, spans, velocities, durations_s, turns, bias_sigma=common)
+        return motion.updated(poses)
 
     def updated(self, poses: Floats, *_: Floats) -> "DopplerMotion":
         return self.turned(steps(poses)[:, :3, :3])

@@ -264,9 +264,8 @@ class SteadyMotion(Motion):
         spans = spans_of(times_s)
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
-        return cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual).updated(
-            poses
-        )
+        motion = cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual)
+        return motion.updated(poses)
 
     def updated(self, poses: Floats, *_: Floats) -> Self:
         """Predict each step of `poses` from its neighbours."""
