@@ -7,7 +7,8 @@ prints for. They import PyTorch, NumPy and trimesh only when a command runs, so 
 import io
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -127,6 +128,15 @@ class Results:
             self._ended = True
             print(as_json(self._values), flush=True)
 
+    @contextmanager
+    def until_stopped(self) -> Iterator[None]:
+        """End the results, and serve in a ``with`` block until Ctrl-C, which is the normal end and not a failure."""
+        self.end()
+        try:
+            yield
+        except KeyboardInterrupt:
+            print("stopped")
+
 
 def as_json(values: Any) -> str:
     """Format as JSON, arrays as lists; non-finite numbers become null."""
@@ -139,11 +149,3 @@ def warn(text: str) -> None:
     """Print a line on standard error, if there is one."""
     if sys.stderr is not None:
         print(text, file=sys.stderr)
-
-
-def until_stopped(wait: Callable[[], None]) -> None:
-    """Wait until Ctrl-C, which is the normal end and not a failure."""
-    try:
-        wait()
-    except KeyboardInterrupt:
-        print("stopped")

@@ -13,7 +13,7 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
-from radarsdf.cli import Results, until_stopped, warn
+from radarsdf.cli import Results, warn
 from radarsdf.cli.inputs import inputs_of, request_of_topics, scans_or_unposed
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.settings import load_config
@@ -168,8 +168,8 @@ def live(given: Namespace, results: Results) -> None:
             shown.show(final=True)
         files.close()
         if urls and request is None and not stopped():
-            results.end()
-            until_stopped(wait)
+            with results.until_stopped():
+                wait()
 
 
 def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> tuple[list[Sink], list[str]]:

@@ -14,7 +14,7 @@ from radarsdf import evaluation
 from radarsdf.arrays import Floats
 from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
-from radarsdf.cli import Results, until_stopped
+from radarsdf.cli import Results
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.scans import add_scans, located, unposed_scans
@@ -145,12 +145,12 @@ def view(given: Namespace, results: Results) -> None:
     scans, explained = _scans(given, radar_map, results)
     options = {"box": given.box, "progress": results.progress, "explained": explained}
     page = {"voxel_size": given.voxel, "host": given.host, "port": given.port}
-    with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer:
+    with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer, results.until_stopped():
         url = url_of(viewer.host, viewer.port)
         print(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it", flush=True)
         if has_display() if given.open is None else given.open:
             webbrowser.open(url)
-        until_stopped(viewer.wait)
+        viewer.wait()
 
 
 def report(given: Namespace, results: Results) -> None:
@@ -220,10 +220,10 @@ def compare(given: Namespace, results: Results) -> None:
         write_changes_report(report, changes, names, edge_m, regions)
         results.add(f"{report} written", report=report)
     if given.view:
-        results.end()
-        with ChangesView(changes, regions, edge_m, host=given.host, port=given.port) as page:
+        page = ChangesView(changes, regions, edge_m, host=given.host, port=given.port)
+        with page, results.until_stopped():
             print(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
-            until_stopped(wait)
+            wait()
 
 
 def grid(given: Namespace, results: Results) -> None:
