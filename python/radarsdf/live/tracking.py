@@ -37,7 +37,8 @@ _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 # Least share of the returns that agree while the sign of the Doppler is open: a wrong one places scans metres off.
 _LEAST_AGREEING = 0.1
 _JUDGED = 24  # last scans whose Doppler is compared with the returns
-_NOT_COMPARED = f"Assumed: the Doppler is right; it is compared with the returns once {_START} scans moved."
+# A comparison of half of them leaves scales open that place scans 5 % of the path off.
+_NOT_COMPARED = f"Assumed: the Doppler is right; it is compared with the returns once {2 * _START} scans moved."
 _PARTED = 3  # last scans that suggest this by agreeing less than those before
 _PULLED = 0.1  # relative difference of the motion by returns and by Doppler that suggests it
 _LEAST_GAIN, _LEAST_STEP_M = 1e-5, 0.1  # of a step whose difference is known
@@ -110,7 +111,8 @@ class _Judged:
 
     time_s: float = -np.inf  # of its last scan
     patience: int = _START // 2  # scans until the next one
-    doubts: tuple[str, ...] = (_NOT_COMPARED,)
+    compared: int = 0  # scans
+    doubts: tuple[str, ...] = ()
 
 
 class Follower:
@@ -177,7 +179,8 @@ class Follower:
         """Return what its pose assumes of the Doppler."""
         if step.given or step.velocity is None:
             return ()
-        return self._judged.get(step.logged.label, _Judged()).doubts
+        judged = self._judged.get(step.logged.label, _Judged())
+        return judged.doubts or ((_NOT_COMPARED,) if judged.compared < 2 * _START else ())
 
     def _of_radar(self, new: Step) -> list[Step]:
         """Return the scans of the same radar, with the new one."""
@@ -196,7 +199,7 @@ class Follower:
         agreeing = np.array([step.found.agreeing for step in steps])
         pulled = len(pulls) == _START and abs(pulls.mean()) > _PULLED + ERRORS * pulls.std() / np.sqrt(_START)
         parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
-        if not (due or pulled or parted or judged.doubts):
+        if not (due or pulled or parted or judged.doubts or not judged.compared):
             return
         # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
         judged.time_s, judged.patience = new.time_s, judged.patience * (1 if due else 2)
@@ -218,7 +221,7 @@ class Follower:
             judged.time_s = -np.inf  # the next scans are judged, too
             msg = f"{notes[-1]} {begin} Give the poses of this scan and the next ones, or leave their Doppler out"
             raise Lost(msg)
-        judged.doubts = tuple(f"{note} {begin}" for note in notes)
+        judged.compared, judged.doubts = count, tuple(f"{note} {begin}" for note in notes)
 
     def track(self, found: list[Step]) -> Track:
         """Return the track that continues with the scans returned by :meth:`seek`."""
