@@ -198,7 +198,7 @@ def _plane_equations(
     """Normal equations of increments of the poses (F, 4, 4) of the radars from common planes: (6 F, 6 F), sparse, and (6 F,)."""
     rays, num_threads = radars.returns.posed(poses), config.num_threads
     surfels = Surfels.of(rays, cell_m / LEAVES_PER_SURFEL, num_threads)
-    planes = planes_of(rays.points, surfels, num_threads)
+    planes = planes_of(rays, surfels, num_threads)
     noise = rig_noise(surfels, rays, config.returns, num_threads)
     # Ghosts of the ground turned a radar that looks aside over a car park by 0.8 degrees.
     planes[first_crossed(surfels, np.flatnonzero(surfels.is_flat()), rays, noise, num_threads) >= 0] = -1

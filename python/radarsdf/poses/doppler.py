@@ -170,6 +170,10 @@ class DopplerMotion(Motion):
         ways = velocities.step_covariances(durations_s)
         shares = np.full((len(durations_s), 6), np.inf)
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
+        # A change of the turn rate bends the way: at constant angular acceleration, by a twelfth of the change in a step.
+        bends_rad2_s2 = np.square(np.diff(turns / durations_s[:, None], axis=0) / 12).sum(axis=0) / max(len(turns) - 1, 1)
+        ways_m = durations_s[:, None] * velocities.mean_mps[:-1]
+        shares[:, :3] += np.square(skew(ways_m)) @ bends_rad2_s2 * durations_s[:, None] ** 2
         spans = spans_of(times_s)
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)

@@ -161,7 +161,7 @@ def common_planes(
         rows = slice(*np.searchsorted(rays.scans, [low, high]).tolist())
         part = rays.select(rows)
         surfels = Surfels.of(part, cell_m / LEAVES_PER_SURFEL, num_threads)
-        found = planes_of(part.points, surfels, num_threads)
+        found = planes_of(part, surfels, num_threads)
         planes[rows] = np.where(found >= 0, found + np.int32(sum(map(len, centres))), np.int32(-1))
         centres.append(surfels.centres)
         normals.append(unbiased_normals(surfels, num_threads))
@@ -175,10 +175,11 @@ def common_planes(
     return CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, known.of_scans(rays), *together), known
 
 
-def planes_of(points: Floats32, surfels: Surfels, num_threads: int) -> Ints32:
-    """Return the flat surfel (N,) of each point (N, 3), local, m: that of the cell of its projection onto the surface; -1: none."""
+def planes_of(rays: Rays, surfels: Surfels, num_threads: int) -> Ints32:
+    """Return the flat surfel (N,) of each return: that of the cell of its projection onto the surface; -1: none."""
     # Noise moves returns across surfaces into other cells. By the cells of the returns themselves, it would be truncated at cell
     # borders, differently for near and far returns, and rotate poses.
+    points = rays.points
     planes = surfels.flat_planes_at(points, num_threads)
     on = np.flatnonzero(planes >= 0)
     normals = surfels.normals[planes[on]]
@@ -186,6 +187,10 @@ def planes_of(points: Floats32, surfels: Surfels, num_threads: int) -> Ints32:
     feet = np.ascontiguousarray(points[on] - (off[:, None] * normals).astype(np.float32))
     beneath = surfels.flat_planes_at(feet, num_threads)
     planes[on] = np.where(beneath >= 0, beneath, planes[on])
+    # The faces of a wall may share a cell. As one surface, those of a hall made a lap round them 1 % smaller.
+    behind = np.einsum("ni,ni->n", rays.directions[on], surfels.normals[planes[on]]) > 0
+    most = np.bincount(planes[on], 2.0 * behind - 1, len(surfels.centres)) > 0
+    planes[on[behind != most[planes[on]]]] = -1
     return planes
 
 
