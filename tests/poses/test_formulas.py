@@ -259,7 +259,9 @@ def test_motions_of_a_tracked_drive():
     assert np.isinf(turning.shares[:, :3]).all()
     assert_allclose(turning.shares[:, 3:], 1)
     assert np.isinf(moving.shares[:, 3:]).all()
-    assert_allclose(moving.shares[:, :3], 0.01 * 2 * 0.25 / 4 + 0.5**3 / 12)
+    _, by_pitch_m, by_yaw_m = 5 / 12 * (rotation_vectors[2] - rotation_vectors[1])
+    bends_m2 = np.square([0.0, by_yaw_m, by_pitch_m])
+    assert_allclose(moving.shares[0, :3], 0.01 * 2 * 0.25 / 4 + 0.5**3 / 12 + bends_m2)
     assert_allclose(moving.bias_sigma, [0.003 * 10 * 0.5] * 3 + [0] * 3)
     half = rotation(0.5 * rotation_vectors[1]), rotation(rotation_vectors[1])
     path = 0.5 / 6 * (np.eye(3) + 4 * half[0] + half[1]) @ [10.0, 0, 0]

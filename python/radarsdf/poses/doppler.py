@@ -171,7 +171,10 @@ class DopplerMotion(Motion):
         shares = np.full((len(durations_s), 6), np.inf)
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
         # A change of the turn rate bends the way: at constant angular acceleration, by a twelfth of the change in a step.
-        bends_rad2_s2 = np.square(np.diff(turns / durations_s[:, None], axis=0) / 12).sum(axis=0) / max(len(turns) - 1, 1)
+        timed = durations_s > 0  # else, two radars measured at once
+        rates, each_s = turns[timed] / durations_s[timed, None], durations_s[timed]
+        weights = np.square(np.minimum(each_s[1:], each_s[:-1]))
+        bends_rad2_s2 = weights @ np.square(np.diff(rates, axis=0) / 12) / max(weights.sum(), _LEAST_S**2)
         ways_m = durations_s[:, None] * velocities.mean_mps[:-1]
         shares[:, :3] += np.square(skew(ways_m)) @ bends_rad2_s2 * durations_s[:, None] ** 2
         spans = spans_of(times_s)
