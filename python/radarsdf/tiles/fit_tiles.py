@@ -165,7 +165,7 @@ def fit_tile(folder: str, name: str) -> None:
         scale = None if limits is None else IntensityScale.between(limits)
         names = ("clutter_ratio", "returns_per_cell", "sensor", "sensors")
         whole = {name: getattr(plan, name) for name in names}
-        box_cells = plan.box_cells(tile.tile)
+        box_cells = plan.box_cells(tile)
         return FitInput(rays, scale, inside=inside, whole=whole, box_cells=box_cells, radars=radars)
 
     radar_map = fit_rays(read, plan.config, progress=False)

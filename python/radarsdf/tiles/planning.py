@@ -297,6 +297,6 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
                 values[own] = in_map_unit(kept, radar.sensor.unit)
         rays = dataclasses.replace(rays, intensities=values)
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
-    (lower, upper), halo = plan.box_cells(tile.tile)[:, :2], round(plan.halo_m / plan.config.leaf_size_m)
+    (lower, upper), halo = plan.box_cells(tile)[:, :2], round(plan.halo_m / plan.config.leaf_size_m)
     inside = (cells >= lower - halo) & (cells < upper + halo)
     return rays, np.asarray(inside.all(axis=1))
