@@ -1,6 +1,7 @@
 """Optimisers: Adam (Kingma and Ba, ICLR 2015) by PyTorch, sparse Adam for touched feature rows, SOAP for networks."""
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import compress
 from typing import Any
 
 import torch
@@ -55,24 +56,23 @@ class Soap:
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         self.parameters, self.learning_rate = list(parameters), learning_rate
         # A layer with one output has a weight vector: there is no basis to rotate.
-        self._matrices = [i for i, p in enumerate(self.parameters) if p.ndim == 2 and min(p.shape) > 1]
-        self._others = [i for i in range(len(self.parameters)) if i not in self._matrices]
-        self._adam = Adam(_at(self._others, self.parameters), learning_rate)
-        matrices = _at(self._matrices, self.parameters)
+        self._are_matrices = [p.ndim == 2 and min(p.shape) > 1 for p in self.parameters]
+        self._are_others = [not is_matrix for is_matrix in self._are_matrices]
+        self._adam = Adam(compress(self.parameters, self._are_others), learning_rate)
+        matrices = list(compress(self.parameters, self._are_matrices))
         self._weights = [view(p) for p in matrices]
         self._memories = [p.new_zeros(_core.soap_memory_size(*p.shape)) for p in matrices]
-        self._memory_views = [memory.numpy() for memory in self._memories]
 
     def state(self) -> dict[str, Tensor]:
         state = {f"memory.{i}": memory for i, memory in enumerate(self._memories)}
         return state | {f"adam.{k}": v for k, v in self._adam.state().items()}
 
     def step(self, gradients: Sequence[Tensor], number: int, share: float, pool: ThreadPool | None) -> None:
-        self._adam.step(_at(self._others, gradients), number, share, None)
+        self._adam.step(list(compress(gradients, self._are_others)), number, share, None)
         _core.soap_step(
             weights=self._weights,
-            gradients=[g.numpy() for g in _at(self._matrices, gradients)],
-            memories=self._memory_views,
+            gradients=[g.numpy() for g in compress(gradients, self._are_matrices)],
+            memories=[memory.numpy() for memory in self._memories],
             step=number,
             learning_rate=share * self.learning_rate,
             pool=None if pool is None else pool.core_threads,
@@ -80,10 +80,6 @@ class Soap:
 
 
 Optimiser = Adam | Soap
-
-
-def _at(places: Sequence[int], tensors: Sequence[Tensor]) -> list[Tensor]:
-    return [tensors[i] for i in places]
 
 
 class RowAdam:
