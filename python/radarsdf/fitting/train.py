@@ -311,10 +311,9 @@ class Training:
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
-            moved = {name: own for name, own in optimisers.items() if losses != "sdf" or name != "intensity"}
-            move_networks = functools.partial(_move_networks, found, moved, done, share)
+            move_networks = functools.partial(self._move_networks, losses, found, done, share)
             if rows is None:
-                move_networks(self._pool)
+                move_networks()
             else:
                 assert found.touched is not None
                 rows.step(found.touched, done["sdf"], share, self._pool, meanwhile=move_networks)
@@ -339,15 +338,11 @@ class Training:
             if stop:
                 raise KeyboardInterrupt
 
-
-def _move_networks(
-    found: Gradients,
-    optimisers: dict[str, Optimiser],
-    done: dict[str, int],
-    share: float,
-    pool: ThreadPool | None = None,
-) -> None:
-    total = iter(found.by_parameters)
-    for name, optimiser in optimisers.items():
-        own = list(itertools.islice(total, len(optimiser.parameters)))
-        optimiser.step(own, done[name if name in done else "sdf"], share, pool)
+    def _move_networks(self, losses: Losses, found: Gradients, done: dict[str, int], share: float) -> None:
+        total = iter(found.by_parameters)
+        pool = self._pool if found.touched is None else None  # which moves rows meanwhile
+        for name, optimiser in self._optimisers.items():
+            trained = "intensity" if name == "intensity" else "sdf"
+            if losses in ("joint", trained):
+                own = list(itertools.islice(total, len(optimiser.parameters)))
+                optimiser.step(own, done[trained], share, pool)
