@@ -307,11 +307,10 @@ def check_fit(rays: Rays, config: FitConfig, inside: Bools | None = None) -> Non
     if available is None or _estimate(rays, config, len(rays), len(rays)).peak_memory_bytes <= available:
         return
     expected = estimate_rays(rays, config, inside)
-    needs = (
-        f"the fit would need more than the {available / 1e9:.2f} GB available (max_memory_bytes): {expected}"
-    )
+    limit = f"{available / 1e9:.2f} GB available (max_memory_bytes)"
     remedy = "Use larger cells (leaf_size_m), or drop far returns (max_range_m)"
-    check(expected.peak_memory_bytes <= available, f"{needs}. {remedy}", MemoryError)
+    wrong = f"the fit would need more than the {limit}: {expected}. {remedy}"
+    check(expected.peak_memory_bytes <= available, wrong, MemoryError)
 
 
 def check_extent(rays: Rays, config: FitConfig) -> None:

@@ -19,9 +19,8 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule
-from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, Losses
-from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
+from radarsdf.fitting.steps import Adam, AutogradGradients, CoreGradients, Gradients, Losses, RowAdam, Soap
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale
@@ -174,7 +173,7 @@ class Training:
         # Returns of the intensity stage. None: those of the current sampler.
         self._later = None if returns is surface or self._scale is None else returns
         self._rows: RowAdam | None = None
-        self._optimisers: dict[str, Optimiser] = {}
+        self._optimisers: dict[str, Adam | Soap] = {}
         of_network = Soap if training.optimiser == "soap" else Adam
         if config.moves_rows(network is not None):
             self._rows = RowAdam(field.cells, training.learning_rate)

@@ -235,10 +235,9 @@ def cluster_executor(address: str, memory_bytes: int) -> Iterator[Executor]:
     with distributed.Client(address, timeout=_CONNECT_S) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         largest = max((worker["memory_limit"] or math.inf for worker in workers), default=math.inf)
-        takes = (
-            f"a tile takes about {memory_bytes / 1e6:.0f} MB and no worker has more than {largest / 1e6:.0f}"
-        )
-        check(memory_bytes <= largest, f"{takes}: make the plan with smaller tiles", MemoryError)
+        most = f"no worker has more than {largest / 1e6:.0f}: make the plan with smaller tiles"
+        takes = f"a tile takes about {memory_bytes / 1e6:.0f} MB"
+        check(memory_bytes <= largest, f"{takes} and {most}", MemoryError)
         # With pure=True, a second task with the same arguments would get the first result, although its file may be gone.
         executor = client.get_executor(pure=False)
         try:

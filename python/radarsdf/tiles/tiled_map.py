@@ -73,7 +73,7 @@ class TiledMap(TileBlend):
             stop = np.array([*np.minimum(own + edge, last[:2]), last[2]])
             if (start < stop).all():
                 x, y, z = (stop - start).tolist()
-                here = start - planned.origin_cells
+                here = start - np.array(planned.origin_cells)
                 found = dense_cells(self.contents_of(planned), here, (x, y, z))
                 place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
                 passed[place], returns[place], observed[place] = found
