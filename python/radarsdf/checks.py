@@ -30,10 +30,10 @@ _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; sc
 _RIGID = f"rotation, translation within {MAX_POSITION_M:g} m, last row 0 0 0 1"
 
 
-def check(holds: object, message: str) -> None:
-    """Raise a ValueError with this message unless `holds`."""
+def check(holds: object, message: str, error: type[Exception] = ValueError) -> None:
+    """Raise an `error` with this message unless `holds`."""
     if not holds:
-        raise ValueError(message)
+        raise error(message)
 
 
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:

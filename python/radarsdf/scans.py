@@ -330,8 +330,7 @@ def filled(points: Any, **given: Any) -> tuple[Any, ...]:
         scans, points = points, points.points  # reads everything in one pass
         rig = scans.rig
         given = {name: getattr(scans, name) if values is None else values for name, values in given.items()}
-    if given.get("poses", points) is None:
-        raise ValueError(MISSING_POSES)
+    check(given.get("poses", points) is not None, MISSING_POSES)
     return rig, points, *given.values()
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.field import NeuralField
-from radarsdf.fitting.gradients import AutogradGradients, CoreGradients
 from radarsdf.fitting.sampling import Batch, RaySampler
+from radarsdf.fitting.steps import AutogradGradients, CoreGradients
 from radarsdf.fitting.surface_returns import near_leaf_keys
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import ThreadPool

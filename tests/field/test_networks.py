@@ -9,7 +9,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
 from radarsdf.field.field import Geometry, IntensityNetwork, NeuralField, cells_width, fourier_width
-from radarsdf.fitting.gradients import sdf_loss
+from radarsdf.fitting.steps import sdf_loss
 
 BARE = FitConfig(networks={"view_direction": False, "log_range": False})
 

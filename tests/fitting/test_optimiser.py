@@ -6,7 +6,7 @@ import torch
 from radarsdf._core import CellSet, Encoding
 from radarsdf.field import kernels
 from radarsdf.field.field import VertexFeatures
-from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
+from radarsdf.fitting.steps import Adam, RowAdam, Soap, Touched
 from radarsdf.threads import ThreadPool
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import Diverged, FitConfig, Interrupted, _core
-from radarsdf.fitting.optimiser import Adam
+from radarsdf.fitting.steps import Adam
 from radarsdf.interrupts import deferred_interrupts, terminable
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -43,7 +43,7 @@ def interrupted_python(code, delay_s=0.0):
 
 # Prints "ready" after a number of steps of the optimisers, of which a joint fit has two.
 ANNOUNCED = """
-from radarsdf.fitting.optimiser import Adam
+from radarsdf.fitting.steps import Adam
 step, steps = Adam.step, 0
 def announced(*arguments):
     global steps

@@ -7,7 +7,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.fitting import train
 from radarsdf.fitting.estimate import Schedule
-from radarsdf.fitting.gradients import CoreGradients, sdf_loss
+from radarsdf.fitting.steps import CoreGradients, sdf_loss
 from radarsdf.fitting.train import LossHistory
 
 from ..settings import grouped

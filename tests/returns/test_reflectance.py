@@ -92,7 +92,7 @@ def views(seed=0, kinds=(LEVEL, STEEP), count=COUNT):
     )
     kind = rng.choice(np.array(kinds, np.int8), count)
     incidence = np.where(kind == NO_SURFACE, np.nan, rng.uniform(0, 1.4, count))
-    return (
+    return reflectance.Views(
         directions.astype(np.float32),
         rng.uniform(2, 40, count).astype(np.float32),
         incidence.astype(np.float32),
@@ -103,7 +103,7 @@ def views(seed=0, kinds=(LEVEL, STEEP), count=COUNT):
 def error(values, seen, asked=None, truth=None):
     """Mean absolute error of predictions from `values` of returns."""
     asked, truth = (seen, values) if asked is None else (asked, truth)
-    found = reflectance.response(*reflectance.fit_response(values, *seen), *asked)
+    found = reflectance.response(*reflectance.fit_response(values, seen), asked)
     return float(np.abs(found - truth).mean())
 
 

@@ -28,7 +28,7 @@ def tiles_of(drive, out, **arguments):
 
 def test_one_tile_equals_one_fit(drive, tmp_path):
     city = tiles_of(drive, tmp_path / "city", tile_size=512, halo=51.2)
-    contents = {tile.tile: city.contents_of(tile.tile) for tile in city.tiles}
+    contents = {tile.tile: city.contents_of(tile) for tile in city.tiles}
     assert len(contents) == 2  # the drive crosses a border, and each tile has the returns within 51 m
     part = contents[0, 0]
     scale = (city.intensity_scale.low, city.intensity_scale.high)

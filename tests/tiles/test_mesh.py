@@ -17,7 +17,7 @@ def in_one_go(city, steps, min_triangles):
     voxel_m = city.config.leaf_size_m / steps
     parts = []
     for tile in city.tiles:
-        cells = city.contents_of(tile.tile).field.table.leaf_cells() + plan.origin_cells(tile.tile)
+        cells = city.contents_of(tile).field.table.leaf_cells() + tile.origin_cells
         weights = plan.grid.weights(tile.tile, city.config.lattice.position(cells + 0.5))
         parts.append(cells[weights > 0])
     owned = {tile.tile for tile in city.tiles}

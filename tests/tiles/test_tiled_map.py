@@ -78,7 +78,7 @@ def test_common_properties_equal_those_of_one_map(folder, city, whole, drive):
     owners = plan.grid.tiles_of(np.concatenate([scan.world_points for scan in drive]))
     for planned in plan.tiles:
         assert planned.returns <= (owners == planned.tile).all(axis=1).sum()
-        lower, upper = plan.box_cells(planned.tile) + plan.origin_cells(planned.tile)
+        lower, upper = plan.box_cells(planned) + planned.origin_cells
         np.testing.assert_array_equal(lower[:2], np.array(planned.tile) * plan.tile_cells)
         np.testing.assert_array_equal(upper - lower, [plan.tile_cells] * 2 + [2 * MAX_CELLS_FROM_ORIGIN])
 

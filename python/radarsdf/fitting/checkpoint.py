@@ -39,9 +39,8 @@ class Checkpoint:
         if self._path.exists():
             check_regular_file(self._path)
             self._check_identity()
-        elif not self._path.parent.is_dir():
-            msg = f"there is no folder {self._path.parent} for the checkpoint"
-            raise FileNotFoundError(msg)
+        folder = self._path.parent
+        check(folder.is_dir(), f"there is no folder {folder} for the checkpoint", FileNotFoundError)
 
     def due(self) -> bool:
         return time.monotonic() >= self._next_s

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf._core import FEATURE_DIM, CellSet
 from radarsdf.arrays import Bools
-from radarsdf.checks import instance
+from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import intensity_widths, sdf_widths, weights_of
 from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_BAND_CELLS, NEAR_SAMPLES, near_and_labelled
@@ -307,12 +307,10 @@ def check_fit(rays: Rays, config: FitConfig, inside: Bools | None = None) -> Non
     if available is None or _estimate(rays, config, len(rays), len(rays)).peak_memory_bytes <= available:
         return
     expected = estimate_rays(rays, config, inside)
-    if expected.peak_memory_bytes > available:
-        msg = (
-            f"the fit would need more than the {available / 1e9:.2f} GB available (max_memory_bytes): {expected}. "
-            "Use larger cells (leaf_size_m), or drop far returns (max_range_m)"
-        )
-        raise MemoryError(msg)
+    limit = f"{available / 1e9:.2f} GB available (max_memory_bytes)"
+    remedy = "Use larger cells (leaf_size_m), or drop far returns (max_range_m)"
+    wrong = f"the fit would need more than the {limit}: {expected}. {remedy}"
+    check(expected.peak_memory_bytes <= available, wrong, MemoryError)
 
 
 def check_extent(rays: Rays, config: FitConfig) -> None:

@@ -19,9 +19,8 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule
-from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, Losses
-from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
+from radarsdf.fitting.steps import Adam, AutogradGradients, CoreGradients, Gradients, Losses, RowAdam, Soap
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale
@@ -174,7 +173,7 @@ class Training:
         # Returns of the intensity stage. None: those of the current sampler.
         self._later = None if returns is surface or self._scale is None else returns
         self._rows: RowAdam | None = None
-        self._optimisers: dict[str, Optimiser] = {}
+        self._optimisers: dict[str, Adam | Soap] = {}
         of_network = Soap if training.optimiser == "soap" else Adam
         if config.moves_rows(network is not None):
             self._rows = RowAdam(field.cells, training.learning_rate)
@@ -311,10 +310,9 @@ class Training:
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
-            moved = {name: own for name, own in optimisers.items() if losses != "sdf" or name != "intensity"}
-            move_networks = functools.partial(_move_networks, found, moved, done, share)
+            move_networks = functools.partial(self._move_networks, losses, found, done, share)
             if rows is None:
-                move_networks(self._pool)
+                move_networks()
             else:
                 assert found.touched is not None
                 rows.step(found.touched, done["sdf"], share, self._pool, meanwhile=move_networks)
@@ -339,15 +337,11 @@ class Training:
             if stop:
                 raise KeyboardInterrupt
 
-
-def _move_networks(
-    found: Gradients,
-    optimisers: dict[str, Optimiser],
-    done: dict[str, int],
-    share: float,
-    pool: ThreadPool | None = None,
-) -> None:
-    total = iter(found.by_parameters)
-    for name, optimiser in optimisers.items():
-        own = list(itertools.islice(total, len(optimiser.parameters)))
-        optimiser.step(own, done[name if name in done else "sdf"], share, pool)
+    def _move_networks(self, losses: Losses, found: Gradients, done: dict[str, int], share: float) -> None:
+        total = iter(found.by_parameters)
+        pool = self._pool if found.touched is None else None  # which moves rows meanwhile
+        for name, optimiser in self._optimisers.items():
+            trained = "intensity" if name == "intensity" else "sdf"
+            if losses in ("joint", trained):
+                own = list(itertools.islice(total, len(optimiser.parameters)))
+                optimiser.step(own, done[trained], share, pool)

@@ -69,9 +69,8 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     first = np.floor(corners[0] / size + 1e-6)
     counts = np.maximum(1, np.ceil(corners[1] / size - 1e-6) - first)
     voxels = np.prod(counts) * parts**3
-    if voxels > _MAX_VOXELS:
-        msg = f"the box has {voxels:.3g} voxels, more than {_MAX_VOXELS}: use a smaller box, or larger voxels"
-        raise MemoryError(msg)
+    most = f"more than {_MAX_VOXELS}: use a smaller box, or larger voxels"
+    check(voxels <= _MAX_VOXELS, f"the box has {voxels:.3g} voxels, {most}", MemoryError)
     shape = tuple((counts.astype(np.int64) * parts).tolist())
     fine = _fine_grid(radar_map, first * size, size / parts, shape)
     return fine if parts == 1 else _coarser(fine, parts)

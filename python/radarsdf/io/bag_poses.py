@@ -279,10 +279,9 @@ def topic_poses(name: str, track: Track, tree: TransformTree, sensor: str, reque
 def tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about, moving = request.notes.about, tree.moving
-    if not moving:
-        what = "TF that moves" if tree.tracks else "Odometry, PoseStamped, Path or TF"
-        msg = f"{about} has no poses ({what}): give a file of poses, such as TUM; {FIND_POSES}"
-        raise NoPoses(msg)
+    what = "TF that moves" if tree.tracks else "Odometry, PoseStamped, Path or TF"
+    remedy = f"give a file of poses, such as TUM; {FIND_POSES}"
+    check(moving, f"{about} has no poses ({what}): {remedy}", NoPoses)
     base = sensor
     if request.extrinsic is not None or sensor not in tree.tracks:
         lowest = moving - {above for frame in moving for above in tree.chain(frame)[1:]}
@@ -295,9 +294,8 @@ def tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     world = chain[-1] if request.world_frame is None else request.world_frame.lstrip("/")
     check(world in chain, f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}")
     below = chain[: chain.index(world)]
-    if not moving & set(below):
-        msg = f"{about}: no transform between {world} and {base} moves: TF has no poses of the radar"
-        raise NoPoses(msg)
+    still = f"no transform between {world} and {base} moves: TF has no poses of the radar"
+    check(moving & set(below), f"{about}: {still}", NoPoses)
     find = tree.finder(world, request)
     poses = find(base)
     check(poses, f"{about}: a transform between {world} and {base} has a single pose")

@@ -124,9 +124,8 @@ def read(
     paths = [path_of(part, "path") for part in ([path] if single or not isinstance(path, Iterable) else path)]
     files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
     for file in (*paths, *map(Path, files)):
-        if not file.exists():  # many readers would not name it
-            msg = f"{file} does not exist"
-            raise FileNotFoundError(msg)
+        # Many readers would not name it.
+        check(file.exists(), f"{file} does not exist", FileNotFoundError)
     request = Request(
         poses=poses,
         extrinsic=None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor"),

@@ -51,9 +51,6 @@ class TensorFile:
         check(whole, "the checksum of its metadata is wrong")
         return found
 
-    def check_metadata(self) -> None:
-        _ = self.checksums
-
     def array(self, name: str) -> Any:
         """Return an array as a view of the file. Raise a ValueError if its checksum is wrong."""
         expected = self.checksums[name]

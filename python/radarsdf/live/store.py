@@ -200,9 +200,7 @@ class ScanLog:
         check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
         row = self._row(scan_id, "radar", *_KINDS)
         if row is None:
-            if scan_id not in self._scans:
-                msg = f"the map has no scan {scan_id!r}"
-                raise KeyError(msg)
+            check(scan_id in self._scans, f"the map has no scan {scan_id!r}", KeyError)
             return self._scans[scan_id]
         _, _, pose, time_s, radar, *blobs = row
         arrays = [

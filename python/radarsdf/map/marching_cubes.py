@@ -137,9 +137,7 @@ class _MarchingCubes(torch.autograd.Function):
 def _as_tensor(volume: Tensor) -> Tensor:
     """Convert `volume` to C order, as float32 or float64 by the rule for arrays."""
     kind = volume.dtype
-    if kind.is_complex:
-        msg = f"volume must be real numbers, not {kind}"
-        raise TypeError(msg)
+    check(not kind.is_complex, f"volume must be real numbers, not {kind}", TypeError)
     small = kind.is_floating_point or kind.itemsize <= 2  # bytes: float32 holds all integers of these
     return volume.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
 
@@ -156,10 +154,9 @@ def _as_samples(volume: ArrayLike) -> Array:
 def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
     refuse_masked(mask, "mask")
     array = np.asarray(mask)
-    if array.dtype != np.bool_ or array.shape != shape:
-        error = TypeError if array.dtype != np.bool_ else ValueError
-        msg = f"mask must be boolean and have the shape of volume, {shape}, not {array.dtype} {array.shape}"
-        raise error(msg)
+    wanted, is_bool = f"boolean and have the shape of volume, {shape}", array.dtype == np.bool_
+    wrong = f"mask must be {wanted}, not {array.dtype} {array.shape}"
+    check(is_bool and array.shape == shape, wrong, ValueError if is_bool else TypeError)
     return np.ascontiguousarray(array)
 
 

@@ -173,7 +173,6 @@ def load_contents(path: AnyPath) -> MapContents:
         check(file.metadata.get("format") == FORMAT, "it has another format")
         version, known = file.metadata.get("format_version", ""), str(FORMAT_VERSION)
         check(version == known, f"it has format version {version!r}, this radarsdf {known}: fit it again")
-        file.check_metadata()
         # Copy: the tensors are views of the file, which may be changed or removed.
         tensors = {name: file.array(name).clone() for name in file.names}
         return contents_of(tensors, json.loads(file.metadata["description"]))

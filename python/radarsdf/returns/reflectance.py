@@ -6,6 +6,7 @@ The regression is robust, on range, elevation and incidence, independent of the 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,15 +52,19 @@ _UNMEASURED = -64.0
 _HALF = -32.0  # after the halving for a network
 
 
+class Views(NamedTuple):
+    """N views of surfaces, by unit vectors from the sensor."""
+
+    directions: Floats32  # (N, 3)
+    ranges_m: Floats32  # (N,)
+    incidence_rad: Floats32  # (N,)
+    kinds: NDArray[np.int8]  # (N,) of surface
+
+
 @np.errstate(under="ignore")  # lobes and kernels underflow far from their centre
-def fit_response(
-    values: Floats32,
-    directions: Floats32,
-    ranges_m: Floats32,
-    incidence_rad: Floats32,
-    kinds: NDArray[np.int8],
-) -> tuple[Floats, Floats32]:
-    """Fit `coefficients` and `table` of a :class:`Reflectance` to `values` (N,) of returns; the others as for :func:`response`."""
+def fit_response(values: Floats32, views: Views) -> tuple[Floats, Floats32]:
+    """Fit `coefficients` and `table` of a :class:`Reflectance` to `values` (N,) of returns."""
+    directions, ranges_m, incidence_rad, kinds = views
     some = slice(None, None, -(-len(values) // _MOST_REGRESSED))
     chosen, y = kinds[some], values[some].astype(np.float64)
     rays = _of_ray(directions[some], ranges_m[some]).astype(np.float64)
@@ -78,15 +83,9 @@ def fit_response(
 
 
 @np.errstate(under="ignore")
-def response(
-    coefficients: Floats,
-    table: Floats32,
-    directions: Floats32,
-    ranges_m: Floats32,
-    incidence_rad: Floats32,
-    kinds: NDArray[np.int8],
-) -> Floats32:
-    """Predict values (N,) along directions (N, 3) from ranges (N,), m, at incidence angles (N,) on kinds of surface (N,)."""
+def response(coefficients: Floats, table: Floats32, views: Views) -> Floats32:
+    """Predict values (N,) for views."""
+    directions, ranges_m, incidence_rad, kinds = views
     of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
     by_angle = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in coefficients]
     found = np.empty(len(kinds), np.float32)
@@ -289,9 +288,9 @@ class Reflectance:
             answers = ask(places[0], unit_vectors, _means(ranges_m, groups))
             unit = unit - np.float32(_NETWORK_TIMES) * answers[groups]
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
-        views = directions, ranges_m, incidence, kinds
-        coefficients, table = fit_response(unit, *views)
-        left = unit - response(coefficients, table, *views)
+        views = Views(directions, ranges_m, incidence, kinds)
+        coefficients, table = fit_response(unit, views)
+        left = unit - response(coefficients, table, views)
         incidence, counts = _means(incidence, groups), np.bincount(groups).astype(np.float64)
         del plane, kinds, views  # per-return arrays: frees memory
         weights = (counts / (1 + _CORRELATION * (counts - 1))).astype(np.float32)
@@ -321,8 +320,8 @@ class Reflectance:
         directions = np.ascontiguousarray(directions)
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
         incidence = _incidence(self.normals, rows, directions)
-        views = directions, ranges_m, incidence, kinds_of(self.normals, rows)
-        found = response(self.coefficients, self.table, *views)
+        views = Views(directions, ranges_m, incidence, kinds_of(self.normals, rows))
+        found = response(self.coefficients, self.table, views)
         found += self._cells.sums(near, directions, incidence, num_threads)
         return found
 

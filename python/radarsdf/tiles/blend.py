@@ -17,7 +17,7 @@ from radarsdf.map.map import Map, Query
 from radarsdf.map.queries import MapContents
 from radarsdf.map.radar_map import load_contents, load_leaf_keys
 from radarsdf.returns.sums import lattice_of
-from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path
+from radarsdf.tiles.plan import Plan, TilePlan, failure_of, is_done, map_path
 
 _MEMORY_BYTES = 1 << 30
 _OF_FEATURES = 2.4  # bytes in memory per feature: measured; includes tables of cells and evidence
@@ -26,7 +26,7 @@ _OF_FEATURES = 2.4  # bytes in memory per feature: measured; includes tables of 
 class Share(NamedTuple):
     """Contribution of one tile at some of N positions."""
 
-    tile: Tile
+    tile: TilePlan
     contents: MapContents  # the map of the tile
     rows: Ints  # (M,) indices of the positions at which the tile has a weight
     weights: Floats  # (M,) weights there
@@ -40,7 +40,7 @@ class TileBlend(Map):
         self.folder = Path(folder)
         self.plan = Plan.load(self.folder)
         self.memory_bytes = positive(memory_bytes, "memory_bytes")
-        self._held: OrderedDict[Tile, tuple[MapContents, int]] = OrderedDict()
+        self._held: OrderedDict[TilePlan, tuple[MapContents, int]] = OrderedDict()
         self._lock = threading.Lock()
         check(self.tiles, f"no tile of {self.folder} is done: run radarsdf tiles fit {self.folder}")
 
@@ -52,22 +52,23 @@ class TileBlend(Map):
     @property
     def missing(self) -> dict[str, str]:
         """Unfinished tiles by name, with the reason of the failure; empty if the fit was not tried or was killed."""
-        undone = (tile for tile in self.plan.tiles if tile.tile not in self.done)
-        return {tile.name: failure_of(self.folder, tile) for tile in undone}
+        done = set(self.tiles)
+        return {tile.name: failure_of(self.folder, tile) for tile in self.plan.tiles if tile not in done}
 
-    @cached_property
-    def done(self) -> set[Tile]:
-        return {tile.tile for tile in self.tiles}
+    def neighbours(self, tile: TilePlan) -> list[TilePlan]:
+        """A finished tile and those of its eight neighbours that are done, in ascending order."""
+        x, y = tile.tile
+        return [other for other in self.tiles if max(abs(other.tile[0] - x), abs(other.tile[1] - y)) <= 1]
 
     @cached_property
     def contents_of_any(self) -> MapContents:
-        return self.contents_of(self.tiles[0].tile)
+        return self.contents_of(self.tiles[0])
 
-    def contents_of(self, tile: Tile) -> MapContents:
+    def contents_of(self, tile: TilePlan) -> MapContents:
         """The map of a finished tile, cached in memory."""
         with self._lock:
             if tile not in self._held:
-                contents = load_contents(map_path(self.folder, self.plan.by_tile[tile]))
+                contents = load_contents(map_path(self.folder, tile))
                 size = round(_OF_FEATURES * sum(p.nbytes for p in contents.field.parameters()))
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)
@@ -75,22 +76,23 @@ class TileBlend(Map):
             self._held.move_to_end(tile)
             return self._held[tile][0]
 
-    def leaf_cells(self, of: Tile, within: Tile) -> Ints:
+    def leaf_cells(self, of: TilePlan, within: TilePlan) -> Ints:
         """(C, 3) leaf cells, by lattice indices, of the map of one finished tile that lie in another one."""
-        keys = load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
-        cells = lattice_of(keys).astype(np.int64) + self.plan.origin_cells(of)
-        return cells[(cells[:, :2] // self.plan.tile_cells == within).all(axis=1)]
+        keys = load_leaf_keys(map_path(self.folder, of))
+        cells = lattice_of(keys).astype(np.int64) + of.origin_cells
+        return cells[(cells[:, :2] // self.plan.tile_cells == within.tile).all(axis=1)]
 
     def _shares(self, world: Floats) -> Iterator[Share]:
         """Yield the shares of tiles at positions (N, 3), world, m, in ascending order, which fixes the bits of sums."""
         return (self._share(world, *near) for near in self._near(world))
 
-    def _share(self, world: Floats, tile: Tile, rows: Ints) -> Share:
+    def _share(self, world: Floats, tile: TilePlan, rows: Ints) -> Share:
         contents, x = self.contents_of(tile), world[rows]
         # Weights depend only on the borders between tiles, not on what a tile observed.
-        return Share(tile, contents, rows, self.plan.grid.weights(tile, x), queries.to_local(contents, x))
+        weights = self.plan.grid.weights(tile.tile, x)
+        return Share(tile, contents, rows, weights, queries.to_local(contents, x))
 
-    def _near(self, world: Floats) -> Iterator[tuple[Tile, Ints]]:
+    def _near(self, world: Floats) -> Iterator[tuple[TilePlan, Ints]]:
         """Yield the tiles with a weight at any of the positions (N, 3), world, m, and the rows (M,) of these."""
         grid, places = self.plan.grid, world[np.isfinite(world).all(axis=1), :2]
         if len(places) == 0:
@@ -99,9 +101,8 @@ class TileBlend(Map):
         first, last = self.corners_m - reach_m, self.corners_m + (grid.tile_m + reach_m)
         near = ((first <= places.max(axis=0)) & (last >= places.min(axis=0))).all(axis=1)
         for i in np.flatnonzero(near).tolist():
-            tile = self.tiles[i].tile
-            if len(rows := grid.within_half_a_halo(tile, world)):
-                yield tile, rows
+            if len(rows := grid.within_half_a_halo(self.tiles[i].tile, world)):
+                yield self.tiles[i], rows
 
     @cached_property
     def corners_m(self) -> Floats:
@@ -114,7 +115,7 @@ class TileBlend(Map):
         # an unfinished one, its neighbours do.
         near, owners = list(self._near(world)), np.full(len(world), -1)
         for number, (tile, rows) in enumerate(near):
-            owners[rows[(self.plan.grid.tiles_of(world[rows]) == tile).all(axis=1)]] = number
+            owners[rows[(self.plan.grid.tiles_of(world[rows]) == tile.tile).all(axis=1)]] = number
         for number, (tile, rows) in enumerate(near):
             share, owner = self._share(world, tile, rows), owners[rows]
             inside = queries.into_cells(share.contents, share.local)
@@ -165,7 +166,7 @@ class TileBlend(Map):
 
         def of_tile(share: Share) -> Floats32:
             # Computed from integers: the same float32 position for every calling tile.
-            origin = self.plan.origin_cells(share.tile) * steps
+            origin = np.array(share.tile.origin_cells) * steps
             points = ((lattice[share.rows] - origin) * voxel_m).astype(np.float32)
             # A corner on the border of the map may be in an outer cell, which has no features.
             inside = queries.into_cells(share.contents, points, voxel_m)

@@ -165,7 +165,7 @@ def fit_tile(folder: str, name: str) -> None:
         scale = None if limits is None else IntensityScale.between(limits)
         names = ("clutter_ratio", "returns_per_cell", "sensor", "sensors")
         whole = {name: getattr(plan, name) for name in names}
-        box_cells = plan.box_cells(tile.tile)
+        box_cells = plan.box_cells(tile)
         return FitInput(rays, scale, inside=inside, whole=whole, box_cells=box_cells, radars=radars)
 
     radar_map = fit_rays(read, plan.config, progress=False)
@@ -235,9 +235,9 @@ def cluster_executor(address: str, memory_bytes: int) -> Iterator[Executor]:
     with distributed.Client(address, timeout=_CONNECT_S) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         largest = max((worker["memory_limit"] or math.inf for worker in workers), default=math.inf)
-        if memory_bytes > largest:
-            msg = f"a tile takes about {memory_bytes / 1e6:.0f} MB and no worker has more than {largest / 1e6:.0f}: make the plan with smaller tiles"
-            raise MemoryError(msg)
+        most = f"no worker has more than {largest / 1e6:.0f}: make the plan with smaller tiles"
+        takes = f"a tile takes about {memory_bytes / 1e6:.0f} MB"
+        check(memory_bytes <= largest, f"{takes} and {most}", MemoryError)
         # With pure=True, a second task with the same arguments would get the first result, although its file may be gone.
         executor = client.get_executor(pure=False)
         try:

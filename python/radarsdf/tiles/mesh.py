@@ -26,7 +26,7 @@ from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.tiles.blend import TileBlend
-from radarsdf.tiles.plan import Tile, folder_of, neighbours
+from radarsdf.tiles.plan import TilePlan, folder_of
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
@@ -67,12 +67,12 @@ def parts_of(
     paths = []
     for planned in tqdm(city.tiles, "mesh", unit="tile", disable=hides_bar(progress)):
         # The file is determined by the settings, the plan and the neighbours.
-        done = [other for other in neighbours(planned.tile) if other in city.done]
+        done = [other.tile for other in city.neighbours(planned)]
         text = repr((city.plan.digest, steps, corners, done))
         key = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         path = folder_of(city.folder, planned.tile) / f"mesh-{key}.npz"
         if not path.is_file():
-            surface, leaf_cells = _surface(city, planned.tile, steps, corners)
+            surface, leaf_cells = _surface(city, planned, steps, corners)
             arrays = {name: value for name, value in vars(surface).items() if name in _ARRAYS}
             counts = np.array([leaf_cells, surface.cells_searched])
             write_arrays(path, arrays | {"cells": counts, "tally": surface.tally.sums})
@@ -81,14 +81,16 @@ def parts_of(
     return paths, limits, Tally(tally)
 
 
-def _surface(city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = None) -> tuple[Surface, int]:
+def _surface(
+    city: TileBlend, tile: TilePlan, steps: int = 1, box: Floats | None = None
+) -> tuple[Surface, int]:
     """Surface in the leaf cells of a tile, world, m, with `steps` voxels along a cell's edge, and the number of the cells."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
     parts = []  # the cells of the tile's map, and those of others with a weight there
-    for other in city.done.intersection(neighbours(tile)):  # in any order: the cells are sorted below
+    for other in city.neighbours(tile):
         theirs = city.leaf_cells(other, within=tile)
-        parts.append(theirs[city.plan.grid.within_half_a_halo(other, position(theirs + 0.5))])
+        parts.append(theirs[city.plan.grid.within_half_a_halo(other.tile, position(theirs + 0.5))])
     cells = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
     if box is not None:
         lower, upper = box
@@ -155,11 +157,11 @@ def export_mesh(
     return len(mesh.vertices), len(mesh.faces)
 
 
-def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
+def viewed_tiles(city: TileBlend, tiles: list[TilePlan]) -> ViewedMap:
     """Arguments of views of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
-    origin = city.config.lattice.position(city.plan.origin_cells(tiles[0]))
+    origin = city.config.lattice.position(tiles[0].origin_cells)
     surfaces = [_surface(city, tile)[0] for tile in tiles]
     vertices, faces = _welded(city, [one.vertices for one in surfaces], [one.faces for one in surfaces])
     used, faces = renumbered(len(vertices), faces)

@@ -100,11 +100,6 @@ class TileGrid:
         return positions[:, :2] - self.corner_m - np.array(tile) * self.tile_m
 
 
-def neighbours(tile: Tile) -> list[Tile]:
-    """A tile and its eight neighbours, in ascending order."""
-    return [(tile[0] + dx, tile[1] + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
-
-
 @settings
 class TilePlan:
     """Properties of a tile known before its fit."""
@@ -147,22 +142,14 @@ class Plan:
     def grid(self) -> TileGrid:
         return TileGrid(self.tile_m, self.halo_m, float(self.config.lattice.position(0)))
 
-    @cached_property
-    def by_tile(self) -> dict[Tile, TilePlan]:
-        return {planned.tile: planned for planned in self.tiles}
-
     @property
     def tile_cells(self) -> int:
         """Edge of a tile, leaf cells."""
         return round(self.tile_m / self.config.leaf_size_m)
 
-    def origin_cells(self, tile: Tile) -> Ints:
-        """(3,) origin of a tile's map, leaf cells of the lattice."""
-        return np.array(self.by_tile[tile].origin_cells, np.int64)
-
-    def box_cells(self, tile: Tile) -> Ints:
+    def box_cells(self, tile: TilePlan) -> Ints:
         """(2, 3) first leaf cell of a tile and the one after the last, from the origin of its map, unbounded in height."""
-        first = np.array(tile) * self.tile_cells - self.origin_cells(tile)[:2]
+        first = np.array(tile.tile) * self.tile_cells - tile.origin_cells[:2]
         height = MAX_CELLS_FROM_ORIGIN
         return np.array([[*first, -height], [*(first + self.tile_cells), height]])
 
@@ -260,5 +247,5 @@ def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
     path = map_path(folder, tile)
     wrong = SafetensorError, KeyError, TypeError, RecursionError
     with reading(path, "a complete radarsdf map", *wrong), open_tensors(path, "np") as file:
-        file.check_metadata()
+        _ = file.checksums  # of the metadata, too
         return checked_report(json.loads(file.metadata["description"])["report"])

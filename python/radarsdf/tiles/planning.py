@@ -45,9 +45,7 @@ def checked_scans(scans: Iterable[Any], digest: hashlib.blake2b) -> Iterator[Sca
     """Check scans one by one, add all to `digest`, and yield those with a rigid pose."""
     rigid = []
     for i, scan in enumerate(one_for_each_scan(scans, "scans")):
-        if not isinstance(scan, Scan):
-            msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
-            raise TypeError(msg)
+        check(isinstance(scan, Scan), f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan", TypeError)
         shape = np.shape(scan.T_world_sensor)
         check(shape == (4, 4), f"scan {i} has no pose: T_world_sensor must be (4, 4), not {shape}")
         for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
@@ -299,6 +297,6 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
                 values[own] = in_map_unit(kept, radar.sensor.unit)
         rays = dataclasses.replace(rays, intensities=values)
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
-    (lower, upper), halo = plan.box_cells(tile.tile)[:, :2], round(plan.halo_m / plan.config.leaf_size_m)
+    (lower, upper), halo = plan.box_cells(tile)[:, :2], round(plan.halo_m / plan.config.leaf_size_m)
     inside = (cells >= lower - halo) & (cells < upper + halo)
     return rays, np.asarray(inside.all(axis=1))

@@ -16,7 +16,7 @@ from radarsdf.map.threshold import VOXEL_M, Threshold
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
-from radarsdf.tiles.plan import Tile, map_path, report_of
+from radarsdf.tiles.plan import TilePlan, map_path, report_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -45,7 +45,7 @@ class TiledMap(TileBlend):
         If the plan is damaged, no tile is done, or a file cannot be read.
     """
 
-    _viewed: "tuple[list[Tile], ViewedMap] | None" = None
+    _viewed: "tuple[list[TilePlan], ViewedMap] | None" = None
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
@@ -73,8 +73,8 @@ class TiledMap(TileBlend):
             stop = np.array([*np.minimum(own + edge, last[:2]), last[2]])
             if (start < stop).all():
                 x, y, z = (stop - start).tolist()
-                here = start - self.plan.origin_cells(planned.tile)
-                found = dense_cells(self.contents_of(planned.tile), here, (x, y, z))
+                here = start - np.array(planned.origin_cells)
+                found = dense_cells(self.contents_of(planned), here, (x, y, z))
                 place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
                 passed[place], returns[place], observed[place] = found
         return CellsInBox(lattice.position(first), passed, returns, observed)
@@ -83,7 +83,7 @@ class TiledMap(TileBlend):
         """View statistics of each cell come from its own tile."""
         found = []
         for planned in self.tiles:
-            of_tile = self.contents_of(planned.tile).views_in_world()
+            of_tile = self.contents_of(planned).views_in_world()
             cells = np.floor(self.config.lattice.cells(of_tile.points)[:, :2])
             found.append(of_tile.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
         return ViewStatisticsAt.together(found)
@@ -91,10 +91,9 @@ class TiledMap(TileBlend):
     def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":
         from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
 
-        tiles = [tile.tile for tile in self.tiles]
         away = np.clip(position[:2], self.corners_m, self.corners_m + self.plan.tile_m) - position[:2]
         near = np.flatnonzero(np.linalg.norm(away, axis=1) <= range_m)
-        tiles = [tiles[i] for i in near] or tiles[:1]  # far from all tiles, any tile shows nothing
+        tiles = [self.tiles[i] for i in near] or self.tiles[:1]  # far from all tiles, any tile shows nothing
         if self._viewed is None or self._viewed[0] != tiles:
             self._viewed = tiles, viewed_tiles(self, tiles)
         return self._viewed[1]
@@ -176,12 +175,12 @@ class TiledMap(TileBlend):
     @cached_property
     def num_cells(self) -> int:
         """Number of leaf cells, each counted in the tile that contains it."""
-        return sum(len(self.leaf_cells(tile.tile, tile.tile)) for tile in self.tiles)
+        return sum(len(self.leaf_cells(tile, tile)) for tile in self.tiles)
 
     @cached_property
     def extent(self) -> Floats:
         """(2, 3) lower and upper corner of all leaf cells, world, m."""
-        of_tiles = [cells for tile in self.tiles if len(cells := self.leaf_cells(tile.tile, tile.tile))]
+        of_tiles = [cells for tile in self.tiles if len(cells := self.leaf_cells(tile, tile))]
         lower = np.min([cells.min(axis=0) for cells in of_tiles], axis=0)
         upper = np.max([cells.max(axis=0) for cells in of_tiles], axis=0)
         return self.config.lattice.position(np.stack([lower, upper + 1]))

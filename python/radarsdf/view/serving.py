@@ -24,7 +24,7 @@ import numpy as np
 from typing_extensions import Self
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import whole_number
+from radarsdf.checks import check, whole_number
 from radarsdf.extras import require
 
 LOCALHOST = "127.0.0.1"
@@ -99,9 +99,8 @@ def guarded(listening: str) -> Iterator[None]:
         yield
     finally:
         library.serve = serve
-    if not started:
-        msg = "this version of viser cannot be guarded against other web pages: install another"
-        raise RuntimeError(msg)
+    remedy = "install another"
+    check(started, f"this version of viser cannot be guarded against other web pages: {remedy}", RuntimeError)
 
 
 def start_server(host: str, port: int) -> Any:
