@@ -1,6 +1,7 @@
 """``radarsdf live`` replays a recording, reports whether the map kept up, and writes it."""
 
 import contextlib
+import json
 import re
 import socket
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 import radarsdf
 from radarsdf.cli.live import replay
 from radarsdf.io.npz import write_scans
-from radarsdf.scans import Scans
+from radarsdf.scans import Scan, Scans
 from radarsdf.view.sinks import FREE_COLOR, foxglove_sink, rerun_sink
 
 from ..conftest import ground_and_wall
@@ -92,19 +93,12 @@ def test_mcap_readers_decode_what_is_shown(recording, capsys):
     values(capsys, "live", recording / "scans.npz", "--rate", 0, "--quiet", "--mcap", out, "-o", made)
     messages = {}
     with out.open("rb") as file:
-        for schema, channel, message, decoded in make_reader(
-            file, decoder_factories=[decoder]
-        ).iter_decoded_messages():
-            messages.setdefault((channel.topic, schema.name.removeprefix("foxglove.")), []).append(
-                (message, decoded)
-            )
+        for schema, channel, *read in make_reader(file, decoder_factories=[decoder]).iter_decoded_messages():
+            kind = channel.topic, schema.name.removeprefix("foxglove.")
+            messages.setdefault(kind, []).append(read)
     one_each = [("/tf", "FrameTransform"), ("/pose/radar", "PoseInFrame"), ("/returns/radar", "PointCloud")]
-    assert set(messages) == {
-        *one_each,
-        ("/surface", "SceneUpdate"),
-        ("/free_space", "VoxelGrid"),
-        ("/grid", "Grid"),
-    }
+    others = [("/surface", "SceneUpdate"), ("/free_space", "VoxelGrid"), ("/grid", "Grid")]
+    assert set(messages) == {*one_each, *others}
     for key in one_each:
         assert [message.log_time for message, _ in messages[key]] == [round(1e8 * i) for i in range(6)]
     cloud = messages[one_each[2]][3][1]
@@ -193,3 +187,17 @@ def test_viewers_are_served_to_this_machine_only(open_sink, library):
         assert all_answer(ports, True)
         assert not any(answers("127.0.0.2", port) for port in ports)  # also this machine, on Linux
     assert all_answer(ports, False)
+
+
+def test_a_viewer_that_connects_later_sees_the_last_messages():
+    pytest.importorskip("foxglove")
+    connect = pytest.importorskip("websockets.sync.client").connect
+    with foxglove_sink(None) as (sink, url):
+        for time_s in (1.0, 2.0):
+            sink.show_scan(Scan(SCENE.points[0], SCENE.poses[0]), time_s)
+        with connect(url, subprotocols=["foxglove.sdk.v1"]) as server:
+            advertised = next(said for said in map(json.loads, server) if said["op"] == "advertise")
+            wanted = [{"id": one["id"], "channelId": one["id"]} for one in advertised["channels"]]
+            server.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            stamps_ns = [int.from_bytes(server.recv(timeout=30)[5:13], "little") for _ in wanted]
+    assert stamps_ns == [2_000_000_000] * 3

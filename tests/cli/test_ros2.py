@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from threading import Lock
+from threading import RLock
 
 import numpy as np
 import pytest
@@ -110,7 +110,7 @@ def test_it_maps_and_publishes(posed, tmp_path, node):
 def test_late_static_transforms_replace_an_assumed_mounting():
     scans = Subscription.__new__(Subscription)
     scans._request = Request(pose_topic="/odom", notes=Notes())
-    scans._tracks, scans._frames, scans._lock = Tracks(_RecentTrack), {"/radar/points": "radar"}, Lock()
+    scans._tracks, scans._frames, scans._lock = Tracks(_RecentTrack), {"/radar/points": "radar"}, RLock()
     scans.unposed, scans._assumed = False, True
 
     def add(topic, message_type, time_s, child, parent, x):
@@ -126,6 +126,10 @@ def test_late_static_transforms_replace_an_assumed_mounting():
     assert scans.remounted()
     assert not scans.remounted()
     assert scans._find("radar").pose_at(1.5, 2.0)[0, 3] == 3.5
+    for time_s in (30.0, 31.0, 1.0, 2.0):  # the clock is set back: a simulator, or a recording, starts again
+        add("/odom", POSE_TYPES[0], time_s, "base", "odom", 50 + time_s)
+    assert scans._find("radar").pose_at(1.5, 2.0)[0, 3] == 53.5
+    assert scans._find("radar").pose_at(30.5, 2.0) is None
 
 
 def test_other_types_are_named(node):

@@ -101,10 +101,17 @@ class Results:
         self._values: dict[str, Any] = {}
         self._ended = False
 
+    def say(self, line: str) -> None:
+        """Print a line for people that is no result: with ``--json``, on standard error."""
+        if self.json:
+            warn(line)
+        else:
+            print(line, flush=True)
+
     def add(self, line: str | None = None, **values: Any) -> None:
         """Print a line for people, and keep its values for programs by name; lengths in m, times in s."""
         if line is not None and not self.json:
-            print(line, flush=True)
+            self.say(line)
         self._values |= values
 
     def table(self, rows: Iterable[Sequence[str]]) -> None:
@@ -135,7 +142,7 @@ class Results:
         try:
             yield
         except KeyboardInterrupt:
-            print("stopped")
+            self.say("stopped")
 
 
 def as_json(values: Any) -> str:

@@ -43,7 +43,7 @@ class Replay:
     """Numbers of scans of a replay, and how long the last ones took."""
 
     integrated: int = 0
-    dropped: int = 0  # the map was not ready
+    dropped: int = 0  # the map was not ready, or ROS 2 knew no pose
     lost: int = 0  # tracking failed for these scans without poses
     seconds: deque[float] = field(default_factory=lambda: deque(maxlen=_TIMED))
     notes: tuple[str, ...] = ()  # what the pose of the last scan assumes
@@ -59,7 +59,7 @@ def replay(
     stopped: Callable[[], bool] = lambda: False,
 ) -> Replay:
     """Integrate scans at `rate` times the recorded speed; 0: as fast as possible. A scan is dropped once the next one arrives."""
-    done, before, known, tried = Replay(), len(live), len(live.scan_ids), 0
+    done, before, known, tried, why = Replay(), len(live), len(live.scan_ids), 0, ""
     # A node goes on after a scan that does not fit, such as one with a repeated time.
     unusable = Lost if isinstance(scans, Scans) else ValueError
     for scan in _due(scans, rate, done, stopped) if isinstance(scans, Scans) else scans:
@@ -78,7 +78,7 @@ def replay(
                 sensor=scan.sensor,
             )
         except unusable as error:
-            done.notes = done.notes if done.seconds else (str(error),)
+            why = f"The last scan that was lost: {error}"
             continue
         done.seconds.append(time.perf_counter() - started)
         done.notes = found.notes
@@ -86,8 +86,9 @@ def replay(
             on_scan(scan, found)
     done.integrated = len(live) - before
     done.lost = tried - done.integrated
+    done.notes += (why,) if why else ()
     if isinstance(scans, Subscription):
-        done.dropped = scans.dropped
+        done.dropped = scans.dropped + scans.unplaced
     return done
 
 
@@ -151,7 +152,7 @@ def live(given: Namespace, results: Results) -> None:
                 else LiveMap(load_config(given), folder=folder, T_body_sensor=scans.T_body_sensor)
             )
             if urls:
-                results.add(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
+                results.say(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
             shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
             paced = {"rate": given.rate, "on_scan": shown, "stopped": stopped}
             done = replay(growing, scans, with_poses=not unposed, **paced)

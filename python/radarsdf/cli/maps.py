@@ -147,7 +147,7 @@ def view(given: Namespace, results: Results) -> None:
     page = {"voxel_size": given.voxel, "host": given.host, "port": given.port}
     with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer, results.until_stopped():
         url = url_of(viewer.host, viewer.port)
-        print(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it", flush=True)
+        results.say(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it")
         if has_display() if given.open is None else given.open:
             webbrowser.open(url)
         viewer.wait()
@@ -222,7 +222,7 @@ def compare(given: Namespace, results: Results) -> None:
     if given.view:
         page = ChangesView(changes, regions, edge_m, host=given.host, port=given.port)
         with page, results.until_stopped():
-            print(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
+            results.say(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it")
             wait()
 
 

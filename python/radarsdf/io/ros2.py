@@ -31,6 +31,7 @@ _THIS_MACHINE = (
 )
 _QUEUED = 100  # scans of a radar: 5 s at 20 Hz
 _KEPT_POSES = 1000  # of each frame: tf2 keeps those of 10 s
+_SET_BACK_S = 1.0  # more than poses of several nodes are out of order
 _PATIENCE_S = 3.0  # for poses of the first scan, and until it is reported what is missing
 _STEP_S = 0.01
 _STATIC = "/tf_static"
@@ -165,6 +166,8 @@ class _RecentTrack(Track):
     """The last poses of a frame. One that stands still may move again: only static transforms are constant."""
 
     def add(self, numbers: tuple[float, ...]) -> None:
+        if self.numbers and numbers[0] < self.numbers[-9] - _SET_BACK_S:
+            del self.numbers[:]  # the clock was set back: as tf2, forget the poses before
         super().add(numbers)
         if len(self.numbers) > 2 * 9 * _KEPT_POSES:
             del self.numbers[: -9 * _KEPT_POSES]
@@ -216,7 +219,8 @@ class Subscription:
         self._error: Exception | None = None
         self._queue: deque[tuple[float, RawScan]] = deque(maxlen=_QUEUED * len(self._topics))
         self.dropped = 0  # scans that arrived faster than they were taken, or before the mountings
-        self._lock = threading.Lock()
+        self.unplaced = 0  # scans without a pose
+        self._lock = threading.RLock()
         threading.Thread(target=self._listen, daemon=True).start()
         self._await_poses()
         self._assumed = self._is_assumed()
@@ -252,6 +256,7 @@ class Subscription:
         """Yield scans, with poses of the body if there are mountings, and note at the end what was left out."""
         mounted = self.T_body_sensor
         for scan in posed(self._raw_scans, self._find, self._request):
+            self.unplaced -= 1
             if mounted is None:
                 yield replace(scan, sensor=None)
             else:
@@ -272,6 +277,7 @@ class Subscription:
                 if poses is None or poses.pose_at(raw.time_s or 0.0, longest_s) is not None:
                     break
                 self._wait()  # the pose after the scan is yet to come
+            self.unplaced += 1  # until it is
             yield raw
 
     def _wait(self) -> None:
@@ -303,7 +309,8 @@ class Subscription:
         return _Known(tree, topics.get(name or ""), find, error, request.notes.lines)
 
     def _find(self, frame: str) -> Any:
-        return UNPOSED if self.unposed else self._known().find(frame)
+        with self._lock:  # it reads poses that arrive meanwhile
+            return UNPOSED if self.unposed else self._known().find(frame)
 
     def _mounted(self) -> dict[Label, Floats]:
         """T_body_sensor by topic, of several radars; empty if TF does not mount all of them on one body."""

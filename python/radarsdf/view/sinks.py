@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, cast
@@ -64,6 +64,13 @@ class FoxgloveSink(Sink):
     def __init__(self, foxglove: Any, context: Any) -> None:
         self._foxglove, self._of, self._context = foxglove, foxglove.messages, context
         self._channels: dict[str, Any] = {}
+        self._last: dict[str, tuple[bytes, int]] = {}  # message and its time, ns, by topic
+
+    def show_again(self, _client: Any, channel: Any) -> None:
+        """Log the last message of a channel again, for a client that subscribes later."""
+        if channel.topic in self._last:
+            encoded, time_ns = self._last[channel.topic]
+            self._channels[channel.topic].log(encoded, log_time=time_ns)
 
     def show_scan(self, scan: Scan, time_s: float) -> None:
         of, frame, T = self._of, _frame_of(scan), scan.T_world_sensor
@@ -115,6 +122,7 @@ class FoxgloveSink(Sink):
             options = {"message_encoding": "protobuf", "context": self._context}
             self._channels[topic] = self._foxglove.Channel(topic, schema=schema.get_schema(), **options)
         encoded = encoded or schema(timestamp=self._stamp(time_s), **values).encode()
+        self._last[topic] = encoded, round(1e9 * time_s)
         self._channels[topic].log(encoded, log_time=round(1e9 * time_s))
 
     def _stamp(self, time_s: float) -> Any:
@@ -227,13 +235,18 @@ def foxglove_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
     context = foxglove.Context()
     if path is not None:
         checked_suffix(path, [".mcap"], "Foxglove")
-        with whole_file(path) as file, foxglove.open_mcap(file, context=context):
+        with whole_file(path) as file, foxglove.open_mcap(file, context=context) as written:
             yield FoxgloveSink(foxglove, context), ""
+            _end(path, written.close)
         return
     port = free_port(LOCALHOST, None, 8765)
-    server = foxglove.start_server(name="radarsdf", host=LOCALHOST, port=port, context=context)
+    sink = FoxgloveSink(foxglove, context)
+    listener = importlib.import_module("foxglove.websocket").ServerListener
+    of_clients = type("Subscribed", (listener,), {"on_subscribe": sink.show_again})()
+    options = {"context": context, "server_listener": of_clients}
+    server = foxglove.start_server(name="radarsdf", host=LOCALHOST, port=port, **options)
     try:
-        yield FoxgloveSink(foxglove, context), f"ws://{LOCALHOST}:{port}"
+        yield sink, f"ws://{LOCALHOST}:{port}"
     finally:
         server.stop()
 
@@ -248,6 +261,7 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
         with whole_file(path) as file, TemporaryDirectory(dir=path.absolute().parent) as folder:
             stream.save(growing := Path(folder) / "growing.rrd")
             yield RerunSink(rerun, stream), ""
+            _end(path, stream.flush)
             stream.disconnect()
             with growing.open("rb") as written:
                 shutil.copyfileobj(written, file)
@@ -268,6 +282,15 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
             server.terminate()
 
 
+def _end(path: Path, last: Callable[[], None]) -> None:
+    """Complete a file. The SDKs raise a RuntimeError if anything was not written, such as on a full disk."""
+    try:
+        last()
+    except RuntimeError as error:
+        msg = f"{path} was not written: {error}"
+        raise OSError(msg) from error
+
+
 def uncertainty_colors(mesh: "trimesh.Trimesh") -> Bytes:
     """Return the sRGB colours (V, 3) of the vertices of a mesh by their uncertainty."""
     uncertainty_m = np.asarray(mesh.vertex_attributes["uncertainty_m"])
@@ -275,7 +298,9 @@ def uncertainty_colors(mesh: "trimesh.Trimesh") -> Bytes:
 
 
 def _frame_of(scan: Scan) -> str:
-    return "radar" if scan.sensor is None else f"radar_{scan.sensor}"
+    return (
+        "radar" if scan.sensor is None else f"radar_{scan.sensor}".replace("/", "_")
+    )  # no parent of another
 
 
 def _cells(state: Array) -> Array:
