@@ -140,6 +140,11 @@ def test_doppler_that_returns_do_not_decide_is_assumed_and_noted(drive):
     live = LiveMap(SETTINGS)
     assert follow(live, scans, motion, range(12)).notes  # too few are compared
     assert not follow(live, scans, motion, range(12, 18)).notes
+    added = dataclasses.replace(
+        motion, doppler_mps=[speeds + np.float32(0.5) for speeds in motion.doppler_mps]
+    )
+    with pytest.raises(Lost, match="m/s are added to that of all returns"):
+        follow(LiveMap(SETTINGS), scans, added, range(12))
     stationary = dataclasses.replace(motion, doppler_mps=[0 * speeds for speeds in motion.doppler_mps])
     assert follow(LiveMap(SETTINGS), scans, stationary, range(9)).notes
 

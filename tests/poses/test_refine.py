@@ -306,17 +306,12 @@ def test_a_noisy_scan_has_an_unbiased_height(height_m):
 
 def test_the_faces_of_a_wall_do_not_attract_each_other():
     """Regression: as one plane, they moved the scans of each side by half of its thickness."""
-    rng, poses = np.random.default_rng(4), np.tile(np.eye(4), (10, 1, 1))
+    rng, scans, poses = np.random.default_rng(4), [], np.tile(np.eye(4), (10, 1, 1))
     poses[:, 0, 3] = np.tile([-3.0, 3.4], 5)
-    faces = [
-        np.column_stack([rng.normal(0.2 + 0.03 * np.sign(x), 0.01, 3000), rng.uniform(-2, 2, (3000, 2))])
-        for x in poses[:, 0, 3]
-    ]
-    returns = SensorReturns.of(
-        [face - pose[:3, 3] for face, pose in zip(faces, poses, strict=True)], 0.0, None
-    )
-    planes, _ = common_planes(returns, poses, 10, 0.4, None, ReturnsConfig(), 1)
-    apart = planes.solve(
-        np.tile(np.eye(6), (10, 1, 1)), np.zeros((9, 6, 6)), np.zeros((10, 6)), 1e-6, 100, False, 1
-    )[0]
-    assert abs(apart[::2, 0] - apart[1::2, 0]).max() < 0.01
+    for x in poses[:, 0, 3]:
+        face = rng.normal(0.2 + 0.03 * np.sign(x) - x, 0.01, 3000)
+        scans.append(np.column_stack([face, rng.uniform(-2, 2, (3000, 2))]))
+    planes, _ = common_planes(SensorReturns.of(scans, 0.0, None), poses, 10, 0.4, None, ReturnsConfig(), 1)
+    steps = np.tile(np.eye(6), (10, 1, 1)), np.zeros((9, 6, 6)), np.zeros((10, 6))
+    moved = planes.solve(*steps, 1e-6, 100, False, 1)[0][:, 0]
+    assert abs(moved[::2] - moved[1::2]).max() < 0.01

@@ -18,6 +18,7 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import (
     LEAST_MPS,
     NOT_USED,
+    OFFSET,
     BodyVelocities,
     NoVelocityError,
     SensorVelocities,
@@ -38,7 +39,7 @@ _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 _LEAST_AGREEING = 0.1
 _JUDGED = 24  # last scans whose Doppler is compared with the returns
 # A comparison of half of them leaves scales open that place scans 5 % of the path off.
-_NOT_COMPARED = f"Assumed: the Doppler is right; it is compared with the returns once {2 * _START} scans moved."
+_NOT_COMPARED = f"Assumed: the Doppler is right; the returns decide once {2 * _START} scans moved."
 _PARTED = 3  # last scans that suggest this by agreeing less than those before
 _PULLED = 0.1  # relative difference of the motion by returns and by Doppler that suggests it
 _LEAST_GAIN, _LEAST_STEP_M = 1e-5, 0.1  # of a step whose difference is known
@@ -215,9 +216,11 @@ class Follower:
         tested = Consistency.of_returns(drive, self.config)
         trusted, notes = tested.applied(velocities)
         begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
-        if trusted is None and (other := tested.contradicted) is not None and not other.confirmed:
-            notes = [f"Assumed: the Doppler is right; {other.words('the returns')}."]
-        elif trusted is None:
+        if offset_mps := velocities.radial_offset_mps(points, speeds):
+            trusted, notes = None, [OFFSET.format(offset_mps)]
+        elif trusted is None and (other := tested.contradicted) is not None and not other.confirmed:
+            trusted, notes = velocities, [f"Assumed: the Doppler is right; {other.words('the returns')}."]
+        if trusted is None:
             judged.time_s = -np.inf  # the next scans are judged, too
             msg = f"{notes[-1]} {begin} Give the poses of this scan and the next ones, or leave their Doppler out"
             raise Lost(msg)

@@ -202,7 +202,7 @@ _SAME_TRACKED = 0.05  # relative difference of tracked steps and right Doppler: 
 _SHIFTS_M = np.kron([[1.0], [-1.0]], np.kron(np.eye(3)[:2], [[4.0], [2.0], [1.0]]))
 # Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
 _SAME_SCALE = 1.1
-_MEASURED = 0.2  # relative difference from the Doppler beyond which confidence limits leave its scale open
+_MEASURED = 0.1  # relative difference from the Doppler beyond which confidence limits leave its scale open
 _UNKNOWN_SCALE = 0.5  # standard deviation of the scale without evidence: half or twice the speed
 _MOSTLY = 0.8  # share of steps without motion by Doppler from which on returns must confirm it
 _LEAST_SEEN = 0.5  # share of a step's prior variance that the returns remove, if their difference counts

@@ -30,6 +30,7 @@ _IN_COMMON = 0.003
 _OFFSET_ERRORS = 6.0  # standard errors of a significant offset: noise of directions is common to the scans
 _FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
+OFFSET = NOT_USED + ": {:.2f} m/s are added to that of all returns."
 
 
 class NoVelocityError(ValueError):
@@ -175,8 +176,7 @@ class DopplerMotion(Motion):
         rates, each_s = turns[timed] / durations_s[timed, None], durations_s[timed]
         weights = np.square(np.minimum(each_s[1:], each_s[:-1]))
         bends_rad2_s2 = weights @ np.square(np.diff(rates, axis=0) / 12) / max(weights.sum(), _LEAST_S**2)
-        ways_m = durations_s[:, None] * velocities.mean_mps[:-1]
-        shares[:, :3] += np.square(skew(ways_m)) @ bends_rad2_s2 * durations_s[:, None] ** 2
+        shares[:, :3] += np.square(skew(velocities.mean_mps[:-1])) @ bends_rad2_s2 * durations_s[:, None] ** 4
         spans = spans_of(times_s)
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([velocities.common_sigma * speed_mps * usual_duration_s(durations_s), 0.0], 3)

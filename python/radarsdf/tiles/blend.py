@@ -57,8 +57,8 @@ class TileBlend(Map):
 
     def neighbours(self, tile: TilePlan) -> list[TilePlan]:
         """A finished tile and those of its eight neighbours that are done, in ascending order."""
-        x, y = tile.tile
-        return [other for other in self.tiles if max(abs(other.tile[0] - x), abs(other.tile[1] - y)) <= 1]
+        away_m = np.abs(self.corners_m - self.plan.grid.lower_corner(tile.tile)).max(axis=1)
+        return [self.tiles[i] for i in np.flatnonzero(away_m < 1.5 * self.plan.tile_m)]
 
     @cached_property
     def contents_of_any(self) -> MapContents:
