@@ -99,8 +99,8 @@ def guarded(listening: str) -> Iterator[None]:
         yield
     finally:
         library.serve = serve
-    remedy = "install another"
-    check(started, f"this version of viser cannot be guarded against other web pages: {remedy}", RuntimeError)
+    wrong = "this version of viser cannot be guarded against other web pages: install another"
+    check(started, wrong, RuntimeError)
 
 
 def start_server(host: str, port: int) -> Any:

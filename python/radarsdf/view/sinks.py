@@ -298,9 +298,8 @@ def uncertainty_colors(mesh: "trimesh.Trimesh") -> Bytes:
 
 
 def _frame_of(scan: Scan) -> str:
-    return (
-        "radar" if scan.sensor is None else f"radar_{scan.sensor}".replace("/", "_")
-    )  # no parent of another
+    # With a slash, one radar would be the parent of another.
+    return "radar" if scan.sensor is None else f"radar_{scan.sensor}".replace("/", "_")
 
 
 def _cells(state: Array) -> Array:
