@@ -275,6 +275,7 @@ class SteadyMotion(Motion):
         # Damped by half at twice the information: the same gradient, but steps that move together do not overshoot.
         moves, turns = (0.5 * durations_s[:, None] * (r + m) for r, (m, _) in zip(rates, both, strict=True))
         variances = np.concatenate([v for _, v in both], axis=1) * 0.5 * durations_s[:, None] ** 2
+        variances = np.maximum(variances, np.repeat([_LEAST_M**2, _LEAST_RAD**2], 3))
         shares = np.where(np.isinf(self.shares), np.inf, variances)
         return replace(self, steps=transform(turns, moves), shares=shares)
 
