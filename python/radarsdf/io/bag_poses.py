@@ -15,17 +15,9 @@ from scipy.spatial.transform import Rotation
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.io import bag_messages
+from radarsdf.io import poses as pose_files
 from radarsdf.io.bag_messages import Clock, topics_with
-from radarsdf.io.poses import (
-    FIND_POSES,
-    NoPoses,
-    StampedPoses,
-    Trajectory,
-    TransformChain,
-    are_poses,
-    pose_matrices_of,
-    trajectory_of,
-)
+from radarsdf.io.poses import StampedPoses, Trajectory, TransformChain
 from radarsdf.io.recordings import FindPoses, Request
 
 # Names of topics with desired or assumed poses, not measured ones.
@@ -52,7 +44,7 @@ class Track:
     def table(self) -> Floats:
         """(P, 9) the usable poses: finite, with a unit quaternion."""
         table = np.array(self.numbers).reshape(-1, 9)
-        return table[are_poses(table[:, 2:])]
+        return table[pose_files.are_poses(table[:, 2:])]
 
     @cached_property
     def constant(self) -> bool:
@@ -62,7 +54,7 @@ class Track:
     @cached_property
     def matrix(self) -> Floats:
         """T_parent_child (4, 4) of a constant transform."""
-        return np.asarray(pose_matrices_of(self.table[-1:, 2:])[0])
+        return np.asarray(pose_files.pose_matrices_of(self.table[-1:, 2:])[0])
 
     def trajectory(self, name: str, request: Request) -> Trajectory:
         """Trajectory of the poses. Damaged ones are left out and noted."""
@@ -72,7 +64,7 @@ class Track:
             request.notes.add(f"poses of {name} left out: {what}")
         times_s = self.table[:, :2].T
         clock = Clock.of(times_s, name, request.stamps, request.notes)
-        return trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)
+        return pose_files.trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)
 
     def link(self, request: Request) -> Trajectory | Floats:
         """T_parent_child: constant, static from one time to the next, or moving."""
@@ -280,8 +272,8 @@ def tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about, moving = request.notes.about, tree.moving
     what = "TF that moves" if tree.tracks else "Odometry, PoseStamped, Path or TF"
-    remedy = f"give a file of poses, such as TUM; {FIND_POSES}"
-    check(moving, f"{about} has no poses ({what}): {remedy}", NoPoses)
+    remedy = f"give a file of poses, such as TUM; {pose_files.FIND_POSES}"
+    check(moving, f"{about} has no poses ({what}): {remedy}", pose_files.NoPoses)
     base = sensor
     if request.extrinsic is not None or sensor not in tree.tracks:
         lowest = moving - {above for frame in moving for above in tree.chain(frame)[1:]}
@@ -295,7 +287,7 @@ def tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     check(world in chain, f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}")
     below = chain[: chain.index(world)]
     still = f"no transform between {world} and {base} moves: TF has no poses of the radar"
-    check(moving & set(below), f"{about}: {still}", NoPoses)
+    check(moving & set(below), f"{about}: {still}", pose_files.NoPoses)
     find = tree.finder(world, request)
     poses = find(base)
     check(poses, f"{about}: a transform between {world} and {base} has a single pose")

@@ -12,18 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
+from radarsdf import checks
 from radarsdf.arrays import Array, Bools, Floats
-from radarsdf.checks import (
-    AnyPath,
-    are_rigid,
-    check,
-    check_pose,
-    check_poses,
-    interpolated_poses,
-    path_of,
-    pose_matrices,
-    real_array,
-)
+from radarsdf.checks import AnyPath, check, check_pose, check_poses, path_of, real_array
 from radarsdf.io.columns import in_seconds, read_numbers, read_table, read_text, scaled, without_unit
 from radarsdf.io.files import check_regular_file, checked_suffix, reading, write_whole
 from radarsdf.io.npz import array_in
@@ -76,7 +67,7 @@ class Trajectory:
 
     def poses(self, times_s: Floats) -> Floats:
         """Interpolate poses T_world_base (N, 4, 4) at times (N,), s, within the trajectory: linearly, and by slerp."""
-        return interpolated_poses(times_s, self._slerp, self.positions)
+        return checks.interpolated_poses(times_s, self._slerp, self.positions)
 
     def pose_at(self, time_s: float, max_gap_s: float) -> Floats | None:
         """Interpolate the pose T_world_base (4, 4) at one time, s; None outside the trajectory and in longer gaps.
@@ -270,8 +261,8 @@ def _role_of(name: str) -> str:
 def rigid_or_nan(poses: Array, name: str, notes: Notes) -> Floats:
     """Check poses (F, 4, 4) in the order of the scans. Damaged ones become NaN and are noted: their scans have none."""
     with reading(name, "poses (F, 4, 4)", TypeError):
-        matrices = pose_matrices(poses)
-        bad = ~are_rigid(matrices)
+        matrices = checks.pose_matrices(poses)
+        bad = ~checks.are_rigid(matrices)
         if 2 * bad.sum() > len(bad):  # the numbers are not poses at all
             check_poses(matrices)
     if bad.any():

@@ -18,22 +18,11 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
+from radarsdf.io import poses as pose_files
 from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, UNNAMED, check_kitti, read_columns, read_points
 from radarsdf.io.columns import Fields, in_seconds, read_numbers, read_table, scaled, unit_since_1970
 from radarsdf.io.files import reading
-from radarsdf.io.poses import (
-    FIND_POSES,
-    MAX_GAP_S,
-    POSE_FILES,
-    NoPoses,
-    NumberedPoses,
-    Poses,
-    StampedPoses,
-    Trajectory,
-    TransformChain,
-    poses_of,
-    read_transform,
-)
+from radarsdf.io.poses import POSE_FILES, NumberedPoses, Poses, StampedPoses, Trajectory, TransformChain
 from radarsdf.rig import Label
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
@@ -75,7 +64,7 @@ class Request:
     R_sensor_imu: Floats | None = None
     fields: Mapping[str, Any] | None = None
     columns: int | Sequence[str] | None = None
-    max_gap_s: float = MAX_GAP_S
+    max_gap_s: float = pose_files.MAX_GAP_S
     stamps: str | None = None
     world_frame: str | None = None
     notes: Notes = field(default_factory=Notes)
@@ -159,7 +148,7 @@ def scan_poses(
     if isinstance(poses, NumberedPoses):
         poses = _by_number(poses, range(count), request.notes)
     if isinstance(poses, np.ndarray):
-        if request.max_gap_s != MAX_GAP_S:
+        if request.max_gap_s != pose_files.MAX_GAP_S:
             request.notes.add("max_gap_s has no effect: the poses have no times")
         what = "give as many, or poses with time stamps for scans with time stamps"
         check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
@@ -188,14 +177,14 @@ def read_files(
         poses = first_file((folder, *files[0].parents[:2]), POSE_FILES)
         if poses is None:
             what = files[0] if len(files) == 1 else folder
-            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
-            raise NoPoses(msg)
+            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {pose_files.FIND_POSES}"
+            raise pose_files.NoPoses(msg)
         if poses.parent != folder:
             notes.add(f"poses: of {poses}")
-    known = poses_of(poses, notes)
+    known = pose_files.poses_of(poses, notes)
     files, times_s, known = _by_time(files, known, notes)
     if T_base_sensor is None:
-        T_base_sensor = read_transform(folder / BASE_T_RADAR)
+        T_base_sensor = pose_files.read_transform(folder / BASE_T_RADAR)
     columns = request.columns
     if files[0].suffix.lower() not in UNNAMED:
         request.refuse(f"{files[0]} has names of columns", "columns")

@@ -10,17 +10,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from radarsdf import checks
 from radarsdf.arrays import Array, Bools, Floats
-from radarsdf.checks import (
-    MAX_POSITION_M,
-    AnyPath,
-    check,
-    check_pose,
-    instance,
-    positive,
-    real_array,
-    whole_number,
-)
+from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, positive, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -339,7 +331,7 @@ class Map(ABC):
         pose, K = check_pose(T_world_camera, "T_world_camera"), real_array(camera, "camera")
         invertible = K.shape == (3, 3) and np.linalg.matrix_rank(K) == 3
         check(invertible, f"camera must be an invertible (3, 3) matrix, not {K}")
-        width, height = (whole_number(count, "size", 1) for count in size)
+        width, height = (checks.whole_number(count, "size", 1) for count in size)
         check_views(self.config.max_memory_bytes, beams=width * height)
         range_m, position = positive(max_range_m, "max_range_m"), pose[:3, 3]
         viewed = self._viewed_from(position, range_m)
@@ -360,7 +352,7 @@ class Map(ABC):
         if sensor is None:
             return self.sensor
         if isinstance(sensor, Sensor) or not self.sensors:
-            return instance(sensor, Sensor, "sensor")
+            return checks.instance(sensor, Sensor, "sensor")
         known = ", ".join(map(str, self.sensors))
         check(sensor in self.sensors, f"the map has no radar {sensor!r:.50}; its radars are {known}")
         return self.sensors[sensor]
