@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import repeat
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -167,7 +168,11 @@ class Scans:
     def __iter__(self) -> Iterator[Scan]:
         if self._arrays is None:
             return self._read()
-        return (self._scan(i) for i in range(len(self.points)))
+        points, intensities, doppler_mps, sigmas = self._arrays.values()
+        times_s = None if self._times_s is None else map(float, self._times_s)
+        of_radars = intensities, doppler_mps, times_s, sigmas, self.sensors
+        columns = map(np.asarray, points or ()), self.sensor_poses, *of_radars
+        return map(Scan, *(repeat(None) if column is None else column for column in columns))
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -273,15 +278,6 @@ class Scans:
         scans = copy(self)
         scans._ground_truth = cache(points)
         return scans
-
-    def _scan(self, i: int) -> Scan:
-        values = self._loaded().values()
-        points, intensities, doppler_mps, sigma = (None if array is None else array[i] for array in values)
-        time_s = None if self._times_s is None else float(self._times_s[i])
-        pose, rig, sensor = self.poses[i], self._rig, None
-        if rig is not None:
-            pose, sensor = rig.select([i]).sensor_poses(pose[None])[0], rig.labels[rig.of_scan[i]]
-        return Scan(np.asarray(points), pose, intensities, doppler_mps, time_s, sigma, sensor)
 
     def _read(self) -> Iterator[Scan]:
         """Read the files, and keep poses and times of a complete pass."""
