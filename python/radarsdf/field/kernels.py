@@ -90,7 +90,9 @@ class _Weights(NamedTuple):
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
-        out, located = encode(features, points, table)
+        located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
+        out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
+        table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
         ctx.save_for_backward(features, points, located)
         ctx.table = table
         return out
@@ -173,14 +175,6 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
     differentiable by features and points; the gradient by points is the one inside their cell.
     """
     return _Interpolate.apply(features, points, table)  # type: ignore[no-untyped-call]
-
-
-def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
-    """Return :func:`interpolate` without gradients, and the result of :func:`locate`."""
-    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
-    out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-    table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
-    return out, located
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:
