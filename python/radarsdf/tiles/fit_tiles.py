@@ -96,7 +96,13 @@ def plan_tiles(
     """Write the plan and the rays of each tile in one pass over the scans. `threads`: of a fit, unless `config` sets them."""
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    grid = _grid(config, tile_size, halo)
+    block_m = config.lattice.block_m
+    tile_m = _TILE_CELLS * config.leaf_size_m if tile_size is None else positive(tile_size, "tile_size")
+    halo_m = _HALO_CELLS * config.leaf_size_m if halo is None else positive(halo, "halo")
+    tile_m, halo_m = (block_m * max(1, round(wanted_m / block_m)) for wanted_m in (tile_m, halo_m))
+    fits = halo_m <= tile_m
+    check(fits, f"the halo, {halo_m:g} m, is larger than the tile, {tile_m:g} m: use larger tiles")
+    grid = TileGrid(tile_m, halo_m, corner_m=float(config.lattice.position(0)))
     digest = hashlib.blake2b(digest_size=16)
     given = checked_scans(read(scans) if isinstance(scans, (str, PathLike)) else scans, digest)
     if not (folder / PLAN).is_file():
@@ -171,19 +177,6 @@ def fit_tile(folder: str, name: str) -> None:
     radar_map = fit_rays(read, plan.config, progress=False)
     radar_map.report["plan"] = plan.digest_of(tile)
     radar_map.save(map_path(root, tile))
-
-
-def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> TileGrid:
-    lattice = config.lattice
-
-    def blocks(value: float | None, cells: int, name: str) -> float:
-        wanted = cells * lattice.cell_m if value is None else positive(value, name)
-        return lattice.block_m * max(1, round(wanted / lattice.block_m))
-
-    tile_m, halo_m = blocks(tile_size, _TILE_CELLS, "tile_size"), blocks(halo, _HALO_CELLS, "halo")
-    fits = halo_m <= tile_m
-    check(fits, f"the halo, {halo_m:g} m, is larger than the tile, {tile_m:g} m: use larger tiles")
-    return TileGrid(tile_m, halo_m, corner_m=float(lattice.position(0)))
 
 
 def run_tasks(
