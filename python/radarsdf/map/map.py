@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from radarsdf import checks
-from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.arrays import Array, Floats
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, positive, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
@@ -90,7 +90,7 @@ class Map(ABC):
         Where the result, (N,) bool, is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
         """
         world, answer = as_positions(x)
-        return answer(self._observed(world))
+        return answer(np.isfinite(self._evaluate(queries.zero, world, extrapolate=False)))
 
     def uncertainty(self, x: Any) -> Any:
         """Estimate the standard error of the surface's position, from the noise of the returns near positions `x` (N, 3).
@@ -343,9 +343,8 @@ class Map(ABC):
         seen = np.isfinite(depth_m)
         points = position + depth_m[seen, None] * rays[seen]
         image = np.full((height, width, 5), np.nan, np.float32)
-        image[seen.reshape(height, width)] = np.column_stack(
-            [depth_m[seen], self.tangent_planes(points)[1], self.confidence(points)]
-        )
+        of_points = depth_m[seen], self.tangent_planes(points)[1], self.confidence(points)
+        image[seen.reshape(height, width)] = np.column_stack(of_points)
         return DepthImage(image[..., 0], image[..., 1:4], image[..., 4])
 
     def _radar(self, sensor: Sensor | Label | None) -> Sensor:
@@ -446,9 +445,6 @@ class Map(ABC):
     @abstractmethod
     def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
         """Evaluate a query of :mod:`queries` where observed (`extrapolate`: at finite positions) and others finite; else NaN."""
-
-    @abstractmethod
-    def _observed(self, world: Floats) -> Bools: ...
 
     @abstractmethod
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":

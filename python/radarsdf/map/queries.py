@@ -85,6 +85,10 @@ def to_local(contents: WholeMap, world: Floats) -> Floats32:
         return (world - contents.origin).astype(np.float32, order="C")
 
 
+def zero(_: MapContents, points: Floats32) -> Floats32:
+    return np.zeros(len(points), np.float32)
+
+
 def signed_distance(
     contents: MapContents, points: Floats32, *, description: str = "", progress: bool | None = False
 ) -> Floats32:

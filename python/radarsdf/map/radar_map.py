@@ -14,7 +14,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 from typing_extensions import TypedDict
 
-from radarsdf.arrays import Array, Bools, Floats, Keys
+from radarsdf.arrays import Array, Floats, Keys
 from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, GridField, NeuralField
@@ -79,9 +79,6 @@ class RadarMap(Map):
             known = known & np.isfinite(x).all(axis=1)
         return queries.where(known, query, self._contents, points, *rest)
 
-    def _observed(self, world: Floats) -> Bools:
-        return queries.into_cells(self._contents, queries.to_local(self._contents, world))
-
     @property
     def contents_of_any(self) -> MapContents:
         return self._contents
@@ -117,10 +114,8 @@ class RadarMap(Map):
     def save(self, path: AnyPath) -> None:
         tensors, description = parts_of(self._contents)
         for name, tensor in tensors.items():  # what is not finite could not be loaded
-            check(
-                tensor.isfinite().all(),
-                f"{name} of the map contains non-finite numbers: the map is not saved",
-            )
+            finite = tensor.isfinite().all()
+            check(finite, f"{name} of the map contains non-finite numbers: the map is not saved")
         metadata = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "units": _UNITS}
         write_whole(path, tensor_bytes(tensors, metadata | {"description": json.dumps(description)}))
 
@@ -282,9 +277,8 @@ def _taken(
     check_arrays(arrays, wanted)
     for name, array in arrays.items():
         check(np.isfinite(array).all(), f"{name} contains non-finite numbers")
-    return {
-        name: array.view(np.uint64) if array.dtype == np.int64 else array for name, array in arrays.items()
-    }
+        arrays[name] = array.view(np.uint64) if array.dtype == np.int64 else array
+    return arrays
 
 
 def _in_range(name: str, value: Any, highest: float) -> float:
