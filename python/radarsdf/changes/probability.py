@@ -24,9 +24,8 @@ from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
 # Reach of distances around the surface of a field: returns scatter into the next cells.
 _REACH_CELLS = 2.0
-PARALLEL = np.cos(
-    np.pi / 4
-)  # smallest cosine between normals of surfaces that are about parallel: a moved one stays so
+# Smallest cosine between normals of surfaces that are about parallel: a moved one stays so.
+PARALLEL = np.cos(np.pi / 4)
 _BLOCK_M = 32.0  # edge of blocks in which cells are looked up, to limit memory
 # Depth behind a surface at which the 27 cells hardly reach its visible side.
 _BEHIND_CELLS = 1.5

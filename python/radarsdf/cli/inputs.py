@@ -76,9 +76,8 @@ def request_of_topics(given: Namespace) -> Request | None:
     refuse_if(given.rate != 1, f"--ros2 maps scans as they come: --rate {given.rate} would have no effect")
     wrong = [topic for topic in (*given.ros2, given.ros2_odom or "/") if not topic.startswith("/")]
     refuse_if(wrong, f"the name of a topic begins with /, unlike {wrong}")
-    refuse_if(
-        given.find and given.ros2_odom, f"with --find, --ros2-odom {given.ros2_odom} would have no effect"
-    )
+    useless = given.find and given.ros2_odom
+    refuse_if(useless, f"with --find, --ros2-odom {given.ros2_odom} would have no effect")
     refuse_if(not 0 <= given.ros2_domain <= 230, f"--ros2-domain must be 0 to 230, not {given.ros2_domain}")
     arguments = _roles_and_frames(given)
     if given.extrinsic:

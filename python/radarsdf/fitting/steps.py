@@ -307,11 +307,9 @@ class RowAdam:
             decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
             # Denormal numbers would be slow, and are negligible compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
-        of_batch = touched.points, touched.located, touched.gradient
+        arrays = touched.points, touched.located, touched.gradient, *self._arrays, self._decays.numpy()
         rates = number, share * self._learning_rate, _EPSILON
-        self._cells.table.begin_adam_step(
-            *of_batch, *self._arrays, self._decays.numpy(), *rates, pool.core_threads
-        )
+        self._cells.table.begin_adam_step(*arrays, *rates, pool.core_threads)
         try:
             meanwhile()
         finally:

@@ -168,9 +168,8 @@ def average_at_corners(
     Distances depend only on what is within `CELLS_SMOOTHED` of the cells of their rays, to the last bit.
     """
     normals = np.ascontiguousarray(normals, np.float32)
-    weights, truncation_m = np.rint(_WEIGHT_OF_RETURN * rays.counts), config.metres(TRUNCATION_CELLS)
-    distances_m, sides = table.average_rays(
-        rays.points, rays.directions, normals, weights, truncation_m, num_threads, _WEIGHT_OF_RETURN
-    )
+    averaged = rays.points, rays.directions, normals, np.rint(_WEIGHT_OF_RETURN * rays.counts)
+    truncation_m = config.metres(TRUNCATION_CELLS)
+    distances_m, sides = table.average_rays(*averaged, truncation_m, num_threads, _WEIGHT_OF_RETURN)
     of_rays = rays.points, normals, returns.information, sides
     return table.smoothed(distances_m, *of_rays, _SMOOTHINGS, num_threads)

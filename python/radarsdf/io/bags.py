@@ -104,10 +104,9 @@ class _Radars:
         if len(frames) >= len(topics) and (partly or len(mounted) == len(frames)):
             self.body, self.mounted = body, mounted
         listed = ", ".join(self.mounted or frames)
-        found = (
-            f"mountings: TF, {body} -> {listed}" if self.mounted else f"no mountings are known of {listed}"
-        )
-        of_radars = self.body if self.mounted else "each radar"
+        found, of_radars = f"no mountings are known of {listed}", "each radar"
+        if self.mounted:
+            found, of_radars = f"mountings: TF, {body} -> {listed}", self.body
         request.notes.add(f"{found}: poses are those of {of_radars}")
 
     def labelled(self, raw: RawScan) -> RawScan:

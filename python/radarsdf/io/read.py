@@ -241,9 +241,8 @@ def _coloradar(folder: Path, request: Request) -> Scans:
         else:
             with reading(file, "two lines x y z and qx qy qz qw"):
                 numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
-                request = replace(
-                    request, extrinsic=check_pose(pose_files.pose_matrices_of(numbers)[0], "it")
-                )
+                T_base_sensor = check_pose(pose_files.pose_matrices_of(numbers)[0], "it")
+                request = replace(request, extrinsic=T_base_sensor)
     files = (folder / "single_chip/pointclouds/data").glob("radar_pointcloud_*.bin")
     return read_files(sorted(files, key=natural), folder, replace(request, columns=request.columns or 5))
 
@@ -303,9 +302,8 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
         request = replace(request, poses=path)
     if request.extrinsic is None:
         request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ _BODY_T_OCULII)
-    return read_files(
-        sorted(points.glob("*.pcd"), key=natural), folder, request, partial(recordings.lidar_map, folder)
-    )
+    files = sorted(points.glob("*.pcd"), key=natural)
+    return read_files(files, folder, request, partial(recordings.lidar_map, folder))
 
 
 # The first one that fits a folder is used.

@@ -93,10 +93,8 @@ def save_view_picture(path: AnyPath, views: Sequence[View], measured: Sequence[A
         drawn = _draw_returns(axes[-2], view, view.points, view.intensities, limits, "predicted")
         if view.intensities is not None:
             figure.colorbar(drawn, ax=axes[-2], label="intensity")
-        azimuth_deg, elevation_deg = np.rad2deg(view.azimuth_rad), np.rad2deg(view.elevation_rad)
-        image = axes[-1].pcolormesh(
-            azimuth_deg, elevation_deg, view.beam_ranges_m, cmap="viridis_r", shading="nearest"
-        )
+        beams = np.rad2deg(view.azimuth_rad), np.rad2deg(view.elevation_rad), view.beam_ranges_m
+        image = axes[-1].pcolormesh(*beams, cmap="viridis_r", shading="nearest")
         axes[-1].set(title="first surface", xlabel="azimuth, °", ylabel="elevation, °")
         axes[-1].invert_xaxis()  # as seen by the sensor: left is left
         figure.colorbar(image, ax=axes[-1], label="range, m")

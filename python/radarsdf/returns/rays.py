@@ -239,10 +239,8 @@ def prepare(
     most_m = np.inf if max_range_m is None else max_range_m
     scan_of = np.repeat(np.arange(num_scans, dtype=np.int32), [len(scan) for scan in scans])
     R, most_of_scan = T_world_sensor[:, :3, :3].reshape(-1, 9), np.where(rigid, most_m, -1.0)
-    places = R, positions - local_origin, seen_from - local_origin
-    kept, points_m, directions, ranges_m = scan_rays(
-        np.concatenate(scans), scan_of, *places, min_range_m, most_of_scan, num_threads
-    )
+    given = np.concatenate(scans), scan_of, R, positions - local_origin, seen_from - local_origin
+    kept, points_m, directions, ranges_m = scan_rays(*given, min_range_m, most_of_scan, num_threads)
     if len(ranges_m) == 0 and whole:
         msg = f"none of {left_out.given} returns lies between {min_range_m} m and {most_m} m"
         raise ValueError("; ".join([msg, *left_out.notes]))

@@ -156,10 +156,8 @@ class Plan:
     @property
     def intensity_range(self) -> tuple[float, float] | None:
         """Range of the intensities without outliers, in one unit. None: there are none."""
-        known = [
-            (np.array(own.intensity_range), own.sensor.unit) for own in self.radars if own.intensity_range
-        ]
-        ends = [in_map_unit(*own) for own in known]
+        measuring = [radar for radar in self.radars if radar.intensity_range]
+        ends = [in_map_unit(np.array(radar.intensity_range), radar.sensor.unit) for radar in measuring]
         return (float(np.min(ends)), float(np.max(ends))) if ends else None
 
     @property

@@ -183,15 +183,10 @@ class Viewer(Page):
 
     def _add_sensor(self, position: Floats) -> None:
         scale = _GIZMO_SHARE * float(np.linalg.norm(np.ptp(self._extent, axis=0)))
-        self._gizmo = self._server.scene.add_transform_controls(
-            "/sensor",
-            scale,
-            disable_rotations=True,
-            depth_test=False,
-            translation_limits=((-1e6, 1e6),) * 3,
-            position=tuple(position),
-        )
-        self._server.scene.add_icosphere("/sensor/ball", scale / 8, (20, 20, 24))
+        scene, limits = self._server.scene, ((-1e6, 1e6),) * 3
+        handles = {"disable_rotations": True, "depth_test": False, "translation_limits": limits}
+        self._gizmo = scene.add_transform_controls("/sensor", scale, **handles, position=tuple(position))
+        scene.add_icosphere("/sensor/ball", scale / 8, (20, 20, 24))
 
         async def on_update(event: Any) -> None:
             sensor = self._map.origin + np.asarray(event.target.position, np.float64)

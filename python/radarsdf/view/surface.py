@@ -188,13 +188,9 @@ def as_html(name: str, value: Any) -> str:
 @functools.cache
 def templates_of(subpackage: str) -> jinja2.Environment:
     """Environment of the templates of a subpackage, which escapes all values."""
-    options: dict[str, Any] = {
-        "trim_blocks": True,
-        "lstrip_blocks": True,
-        "undefined": jinja2.StrictUndefined,
-    }
-    loader, extensions = jinja2.PackageLoader(f"radarsdf.{subpackage}"), ["jinja2.ext.do"]
-    environment = jinja2.Environment(loader=loader, autoescape=True, extensions=extensions, **options)
+    options: dict[str, Any] = dict.fromkeys(("autoescape", "trim_blocks", "lstrip_blocks"), True)
+    options |= {"undefined": jinja2.StrictUndefined, "extensions": ["jinja2.ext.do"]}
+    environment = jinja2.Environment(loader=jinja2.PackageLoader(f"radarsdf.{subpackage}"), **options)
     environment.filters["css_color"] = css_color
     environment.globals["gradient"] = ",".join(map(css_color, SHARES(np.linspace(0, 1, 9)).tolist()))
     return environment
