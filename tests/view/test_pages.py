@@ -34,7 +34,7 @@ def server(monkeypatch):
     server = SimpleNamespace(
         scene=scene, initial_camera=SimpleNamespace(), atomic=nullcontext, shown=shown, texts=texts
     )
-    server.gui = SimpleNamespace(add_html=texts.append)
+    server.gui = SimpleNamespace(add_html=lambda text: texts.append(text) or SimpleNamespace(content=text))
     monkeypatch.setattr(serving, "require_viser", lambda: None)
     monkeypatch.setattr(serving, "start_server", lambda *_: server)
     monkeypatch.setattr(serving, "stop_server", lambda _: None)
@@ -52,10 +52,10 @@ def test_a_growing_surface_is_replaced(server):
             view.show_surface(mesh, path, 0.0)
         view.show_scan(Scan(np.ones((5, 3), np.float32), np.eye(4) + np.eye(4, k=3) * FAR[0]), 0.0)
     shown = trimesh.load_mesh(io.BytesIO(server.shown["/surface"]), "glb", process=False)
-    np.testing.assert_allclose(
-        np.sort(shown.vertices, axis=0), np.sort(mesh.vertices - origin, axis=0), atol=1e-4
-    )
+    corners = (np.sort(vertices, axis=0) for vertices in (shown.vertices, mesh.vertices - origin))
+    np.testing.assert_allclose(*corners, atol=1e-4)
     assert b"COLOR_0" in server.shown["/surface"]
+    assert all(text in view._legend.content for text in ("standard error", "0.0118", "0.0982"))
     np.testing.assert_allclose(server.shown["/path"], np.stack([path[:-1], path[1:]], 1) - origin)
     np.testing.assert_allclose(server.shown["/returns"][:, 0], 1 + FAR[0] - origin[0], atol=1e-4)
     assert np.abs(server.initial_camera.position).max() < 1000

@@ -16,7 +16,7 @@ from radarsdf.scans import Scan, Scans
 from radarsdf.view.scene import SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_cloud, add_mesh, add_path
 from radarsdf.view.serving import CameraPose, Page, aim, framing_pose
 from radarsdf.view.sinks import FREE_COLOR, PATH_COLOR, Sink, uncertainty_colors
-from radarsdf.view.surface import ShownSurface, as_html, first_hit, quantities_of, thinned
+from radarsdf.view.surface import UNCERTAINTY, ShownSurface, as_html, first_hit, quantities_of, thinned
 
 _GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
 _MARK_SHARE = 0.012  # radius of a click's mark, as a share of its distance: of constant size on the screen
@@ -243,6 +243,7 @@ class GrowingView(Page, Sink):
     def __init__(self, **address: Any) -> None:
         super().__init__(**address)
         self._start()
+        self._legend = self._server.gui.add_html("")
         self._framed = False
 
     def show_scan(self, scan: Scan, time_s: float) -> None:  # noqa: ARG002
@@ -251,11 +252,13 @@ class GrowingView(Page, Sink):
 
     def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:  # noqa: ARG002
         local, server = self._local(mesh.vertices), self._server
+        colors, scale = uncertainty_colors(mesh)
         if not self._framed:
             self._framed = True
             aim(server.initial_camera, framing_pose(local))
         with server.atomic():
-            add_mesh(server, mesh, local, uncertainty_colors(mesh))
+            self._legend.content = as_html("legend", {"label": UNCERTAINTY, "scale": scale})
+            add_mesh(server, mesh, local, colors)
             if len(path) > 1:
                 add_path(server, "/path", self._local(path), PATH_COLOR)
 

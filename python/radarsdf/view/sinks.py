@@ -91,7 +91,7 @@ class FoxgloveSink(Sink):
         lines = of.LinePrimitive(**line).encode() + _points(5, positions)
         lines += _points(6, np.append(PATH_COLOR, 255)[None] / 255)
         # Encoded by NumPy: objects for each vertex take a quarter of a second for 50,000.
-        colors = np.column_stack([uncertainty_colors(mesh), np.full(len(mesh.vertices), 255)]) / 255
+        colors = np.column_stack([uncertainty_colors(mesh)[0], np.full(len(mesh.vertices), 255)]) / 255
         triangles = of.TriangleListPrimitive(pose=line["pose"]).encode() + _points(4, colors)
         triangles += _points(2, self._local(mesh.vertices)) + _field(5, mesh.faces.astype("<u4").tobytes())
         entity = of.SceneEntity(timestamp=self._stamp(time_s), frame_id="map", id="surface").encode()
@@ -148,7 +148,7 @@ class RerunSink(Sink):
         self._log(time_s, {name: pose, f"{name}/returns": self._rerun.Points3D(scan.points, radii=0.05)})
 
     def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:
-        style = {"vertex_normals": mesh.vertex_normals, "vertex_colors": uncertainty_colors(mesh)}
+        style = {"vertex_normals": mesh.vertex_normals, "vertex_colors": uncertainty_colors(mesh)[0]}
         local = {"vertex_positions": self._local(mesh.vertices), "triangle_indices": mesh.faces}
         line = self._rerun.LineStrips3D([self._local(path)], colors=[PATH_COLOR])
         self._log(time_s, {"map/trajectory": line, "map/surface": self._rerun.Mesh3D(**local, **style)})
@@ -291,10 +291,11 @@ def _end(path: Path, last: Callable[[], None]) -> None:
         raise OSError(msg) from error
 
 
-def uncertainty_colors(mesh: "trimesh.Trimesh") -> Bytes:
-    """Return the sRGB colours (V, 3) of the vertices of a mesh by their uncertainty."""
+def uncertainty_colors(mesh: "trimesh.Trimesh") -> tuple[Bytes, Scale]:
+    """Return the sRGB colours (V, 3) of the vertices of a mesh by their uncertainty, and their scale, m."""
     uncertainty_m = np.asarray(mesh.vertex_attributes["uncertainty_m"])
-    return Scale.of(uncertainty_m)(uncertainty_m)
+    scale = Scale.of(uncertainty_m)
+    return scale(uncertainty_m), scale
 
 
 def _frame_of(scan: Scan) -> str:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 
 Position = tuple[float, float, float]
+UNCERTAINTY = "uncertainty (standard error), m"
 
 _SAMPLES = 30_000  # vertices from which the intensity limits are estimated
 # Colours as they are, like those of point clouds and legends.
@@ -170,7 +171,7 @@ def quantities_of(radar_map: "Map", surface: ShownSurface, sensor: Position) -> 
         scale = Scale.of(intensity(some, sensor))
         found["intensity"] = Quantity("predicted intensity, sensor units", intensity, scale, of_sensor=True)
     of_vertices: dict[str, tuple[str, Array]] = {
-        "uncertainty": ("uncertainty (standard error), m", surface.uncertainty_m),
+        "uncertainty": (UNCERTAINTY, surface.uncertainty_m),
         "confidence": ("confidence (probability)", surface.confidence),
         "height": ("height, m", vertices[:, 2]),
     }
