@@ -94,8 +94,8 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
                 "field for a role: x, y, z, range, azimuth, elevation, intensity or doppler; may be repeated"),
     "--columns": (_NAME | {"metavar": "N|NAMES"}, "in files without a header: number of columns, or their names, such as x,y,z,intensity,doppler"),
     "--max-gap": (_FLOAT | {"metavar": "S", "default": 0.5}, "longest gap between poses to interpolate; default: 0.5 s"),
-    "--world-frame": (_NAME, "in a bag with TF: the world frame"),
-    "--stamps": ({"choices": ("header", "record")}, "in a bag: clock of the scans"),
+    "--world-frame": (_NAME, "with poses from TF: the world frame"),
+    "--stamps": ({"choices": ("header", "record")}, "for messages of ROS: clock of the scans"),
 
     "fit -o": (_FILE, "the map to write, .safetensors"),
     "live -o": (_FILE, "the map to write at the end, .safetensors"),
