@@ -237,13 +237,10 @@ def compare(
     corners = None if box is None else check_box(box)
     check_free_space(before, "before")
     if not isinstance(after, Map):
-        names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
-        config = FitConfig.quick(
-            leaf_size_m=before.config.leaf_size_m,
-            num_threads=before.config.num_threads,
-            max_memory_bytes=before.config.max_memory_bytes,
-            returns={"free_space": True} | {name: getattr(before.config.returns, name) for name in names},
-        )
+        own, names = before.config, ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
+        returns = {"free_space": True} | {name: getattr(own.returns, name) for name in names}
+        limits = {"num_threads": own.num_threads, "max_memory_bytes": own.max_memory_bytes}
+        config = FitConfig.quick(leaf_size_m=own.leaf_size_m, returns=returns, **limits)
         after = fit(after, poses, intensities, config=config, progress=progress)
     else:
         given = poses is not None or intensities is not None

@@ -228,14 +228,9 @@ class Map(ABC):
             sensor_position = real_array(viewpoint, "viewpoint")
             is_position = sensor_position.shape == (3,) and (np.abs(sensor_position) <= MAX_POSITION_M).all()
             check(is_position, f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m")
-        mesh: Any = self._surface_mesh(
-            voxel_size,
-            box=box,
-            progress=progress,
-            min_confidence=min_confidence,
-            max_uncertainty=max_uncertainty,
-            min_component_triangles=min_component_triangles,
-        )
+        limits = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
+        limits["min_component_triangles"] = min_component_triangles
+        mesh: Any = self._surface_mesh(voxel_size, box=box, progress=progress, **limits)
         if viewpoint is None or scale is None:
             return mesh
         values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position).astype(np.float32)
