@@ -229,7 +229,7 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
             for connection in reader.connections:
                 name, kind = connection.topic, connection.msgtype
                 named = isinstance(name, str) and isinstance(kind, str)
-                check(named, f"{path} is not a complete bag: a topic has no name or no type")
+                check(named, "a topic has no name or no type")
                 count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
                 topics[name] = Topic(name, kind, count)
     return topics
@@ -300,18 +300,16 @@ def _stream(path: Path, names: set[str]) -> Generator[tuple[float, Path, Any, An
         connections = [c for c in reader.connections if c.topic in names]
         if not connections:  # rosbags would return all messages
             return
-        try:
-            for connection, recorded_ns, raw in reader.messages(connections=connections):
-                # An SQLite database may hold values of any type.
-                known = isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))
-                check(known, "a message has no time or no bytes")
-                yield 1e-9 * recorded_ns, path, connection, raw
-        except Exception as error:  # damaged bags raise exceptions of many kinds
-            raise _damaged(path, error) from error
+        for connection, recorded_ns, raw in reader.messages(connections=connections):
+            # An SQLite database may hold values of any type.
+            known = isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))
+            check(known, "a message has no time or no bytes")
+            yield 1e-9 * recorded_ns, path, connection, raw
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
+    """Open a bag by rosbags. Whatever is raised in the block becomes a ValueError that the bag is not complete."""
     check_regular_file(path if path.is_file() or not (path / _METADATA).is_file() else path / _METADATA)
     require("rosbags", what=f"{path}: bags are read by")
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
@@ -319,15 +317,12 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         reader: Any = (rosbag1 if path.suffix.lower() == ".bag" else rosbag2).Reader(path)
         reader.open()
+        with closing(reader):
+            yield reader
     except PermissionError:
         raise
     except Exception as error:  # damaged bags raise exceptions of many kinds, including OSError
-        raise _damaged(path, error) from error
-    with closing(reader):
-        yield reader
-
-
-def _damaged(path: Path, error: Exception) -> ValueError:
-    remedy = "if its recording was cut off, mcap recover or rosbag reindex may repair it"
-    why = (str(error) or type(error).__name__).rstrip(".")
-    return ValueError(f"{path} is not a complete bag: {why}; {remedy}")
+        remedy = "if its recording was cut off, mcap recover or rosbag reindex may repair it"
+        why = (str(error) or type(error).__name__).rstrip(".")
+        msg = f"{path} is not a complete bag: {why}; {remedy}"
+        raise ValueError(msg) from error

@@ -180,8 +180,6 @@ def _shares(rays: Rays, rows: Ints, normals: Floats) -> Floats:
 
 
 # Vectors are columns (3, M): NumPy takes three times as long on rows of three.
-
-
 def _dot(a: Floats, b: Floats) -> Floats:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
