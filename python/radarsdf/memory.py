@@ -2,24 +2,10 @@
 
 from pathlib import Path
 
-# Bytes, measured.
-_PER_VOXEL = 220.0
-_PER_TRIANGLE = 320.0  # a welded mesh and its normals, measured on hugin in tiles
-# For a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
+# Bytes for a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
 _PER_CELL_TRACED = 300.0  # surface for ray casting, built once per map
 _PER_PATCH_SEEN = 100.0
 _PER_BEAM = 100.0
-
-
-def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> None:
-    """Raise a MemoryError if this many voxels of `voxel_size`, m, exceed the memory."""
-    _check(f"voxels of {voxel_size} m", voxels * _PER_VOXEL, max_memory_bytes, "use larger ones")
-
-
-def check_triangles(count: int, max_memory_bytes: int | None) -> None:
-    """Raise a MemoryError if the mesh of a tiled map has too many triangles for the memory."""
-    remedy = "limit it to a box, or write 3D Tiles (radarsdf tiles mesh -o NAME.json)"
-    _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, remedy)
 
 
 def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0) -> None:
@@ -29,10 +15,12 @@ def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 
     view.
     """
     needed = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM
-    _check("these views", needed, max_memory_bytes, "use fewer poses or returns, or fit a part of the scans")
+    remedy = "use fewer poses or returns, or fit a part of the scans"
+    check_memory("these views", needed, max_memory_bytes, remedy)
 
 
-def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, remedy: str) -> None:
+def check_memory(what: str, needed_bytes: float, max_memory_bytes: int | None, remedy: str) -> None:
+    """Raise a MemoryError if `what` needs more than the limit; None: than is available."""
     available = available_bytes() if max_memory_bytes is None else max_memory_bytes
     if available is not None and needed_bytes > available:
         msg = f"{what} would take about {needed_bytes / 1e9:.2f} GB, of {available / 1e9:.2f}: {remedy}"

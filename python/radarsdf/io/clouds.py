@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Array, Floats, Floats32
@@ -410,13 +409,6 @@ def records(columns: Columns) -> Array:
     """(N,) one record per row of the columns, of which there must be at least one."""
     dtype = np.dtype([(name, array.dtype.newbyteorder("<")) for name, array in columns.items()])
     return np.rec.fromarrays(list(columns.values()), dtype).view(dtype, np.ndarray)
-
-
-def face_records(faces: NDArray[np.integer[Any]]) -> Array:
-    """(T,) one record per triangle (T, 3), as in a binary PLY file."""
-    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
-    rows["count"], rows["rows"] = 3, faces
-    return rows
 
 
 def ply_header(dtype: np.dtype[Any], count: int, num_faces: int | None = None) -> bytes:

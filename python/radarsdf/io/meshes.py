@@ -11,7 +11,7 @@ import numpy as np
 
 from radarsdf.arrays import Array, Bytes, Floats
 from radarsdf.checks import AnyPath, check, path_of, positions
-from radarsdf.io.clouds import face_records, ply_bytes, ply_header, read_points, records
+from radarsdf.io.clouds import ply_bytes, ply_header, read_points, records
 from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, write_whole
 from radarsdf.io.npz import TRUTH_ARRAYS, arrays_of
 from radarsdf.scans import Columns
@@ -162,8 +162,10 @@ def _ply(mesh: "trimesh.Trimesh") -> bytes:
     if colors is not None:
         columns |= dict(zip(("red", "green", "blue", "alpha"), colors.T, strict=True))
     vertices = records(columns)
-    header = ply_header(vertices.dtype, len(vertices), len(mesh.faces))
-    return header + vertices.tobytes() + face_records(mesh.faces).tobytes()
+    faces = np.zeros(len(mesh.faces), [("count", "u1"), ("rows", "<i4", 3)])
+    faces["count"], faces["rows"] = 3, mesh.faces
+    header = ply_header(vertices.dtype, len(vertices), len(faces))
+    return header + vertices.tobytes() + faces.tobytes()
 
 
 def encode_glb(

@@ -20,9 +20,10 @@ from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncerta
 from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.map.threshold import Limits, Tally
-from radarsdf.memory import check_mesh
+from radarsdf.memory import check_memory
 
 _MAX_VOXELS = 2**30  # duplicates included. Lattice coordinates and rows of corners are int32
+_MEMORY_PER_VOXEL = 220.0  # bytes, measured
 # Leaf cells. A cell is skipped if all its corners are farther than this from the surface, on the same side. Measured on
 # four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the cells are left.
 _CLEARLY = 0.25
@@ -212,7 +213,8 @@ def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config:
     within = max(cells, 1) * (parts + 1) ** 3 <= _MAX_VOXELS  # so that coordinates are int32, too
     too_many = f"too many for {cells} cells of {config.leaf_size_m} m: use larger ones"
     check(within, f"voxels of {voxel_size} m are {too_many}")
-    check_mesh(cells * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
+    needed = cells * (parts if even else parts + 1) ** 3 * _MEMORY_PER_VOXEL
+    check_memory(f"voxels of {voxel_size} m", needed, config.max_memory_bytes, "use larger ones")
 
 
 def _corner_distances(

@@ -24,12 +24,13 @@ from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.mesh import Surface, crossed, per_cell, renumbered, subdivided
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
-from radarsdf.memory import check_triangles, check_views
+from radarsdf.memory import check_memory, check_views
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import TilePlan, folder_of
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
+_MEMORY_PER_TRIANGLE = 320.0  # bytes of a welded mesh and its normals, measured on hugin in tiles
 
 _ARRAYS: dict[str, tuple[Any, ...]] = {
     "vertices": (np.float64, None, 3),  # world, m
@@ -134,7 +135,9 @@ def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]
 def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> trimesh.Trimesh:
     paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     file_bytes = sum(path.stat().st_size for path in paths)
-    check_triangles(file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
+    count, most = file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes
+    remedy = "limit it to a box, or write 3D Tiles (radarsdf tiles mesh -o NAME.json)"
+    check_memory(f"a mesh of {count} triangles", count * _MEMORY_PER_TRIANGLE, most, remedy)
     parts = [_read(path).values() for path in paths]
     vertices, faces, confidence, uncertainty_m, cells, _ = zip(*parts, strict=True)
     leaf_cells, searched = np.sum(cells, axis=0).tolist()
