@@ -77,15 +77,16 @@ def with_returns(scan: Scan, kept: Bools) -> Scan:
 class Notes:
     """Sentences on assumptions and omissions, each logged once as a warning of the logger ``radarsdf.io``."""
 
-    def __init__(self, about: str = "the scans") -> None:
-        self.about = about  # what is read, for messages
+    def __init__(self, about: str = "the scans", *, logged: bool = True) -> None:
+        self.about, self._logged = about, logged  # `about`: what is read, for messages
         self.lines: list[str] = []
         self._counts: dict[str, tuple[int, str]] = {}
 
     def add(self, line: str) -> None:
         if line not in self.lines:
             self.lines.append(line)
-            _LOG.warning(line)
+            if self._logged:
+                _LOG.warning(line)
 
     def ending(self) -> str:
         """All sentences, to append to an error."""

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,21 +43,19 @@ class Node:
     """A participant in a DDS domain, at the interface of address `host`. It exchanges encoded messages."""
 
     def __init__(self, domain: int, host: str = LOOPBACK) -> None:
-        require("rosbags", "cyclonedds", what="topics of ROS 2 need")
-        from cyclonedds import builtin, core  # noqa: PLC0415 - an extra
-        from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
-
-        self.domain = domain
+        self.domain, dds = domain, _cyclonedds()
         chosen = 'autodetermine="true"' if host == "0.0.0.0" else f'address="{host}"'
         general = f"<General><Interfaces><NetworkInterface {chosen}/></Interfaces>"
         rest = _THIS_MACHINE if host == LOOPBACK else "</General>"
         try:
             # A configuration, in place of that of the environment.
-            self._domain = Domain(domain, f"<CycloneDDS><Domain>{general}{rest}</Domain></CycloneDDS>")
-            self._participant = DomainParticipant(domain)
-        except core.DDSException as error:
+            configuration = f"<CycloneDDS><Domain>{general}{rest}</Domain></CycloneDDS>"
+            self._domain = dds.domain.Domain(domain, configuration)
+            self._participant = dds.domain.DomainParticipant(domain)
+        except dds.core.DDSException as error:
             msg = f"DDS domain {domain} cannot be joined at {host}: {error.msg}; --host takes the address of an interface"
             raise OSError(msg) from error
+        builtin = dds.builtin
         self._found = builtin.BuiltinDataReader(self._participant, builtin.BuiltinTopicDcpsPublication)
         self._writers: dict[str, Any] = {}
 
@@ -65,51 +64,52 @@ class Node:
 
     def published(self) -> dict[str, dict[str, bool]]:
         """By topic, the types of messages, and whether all who publish them are reliable."""
-        from cyclonedds.qos import Policy  # noqa: PLC0415 - an extra
-
+        reliability = _cyclonedds().qos.Policy.Reliability
         topics: dict[str, dict[str, bool]] = {}
         for endpoint in self._found.read(10_000):
             # Those that left have no name.
             package, _, name = (endpoint.type_name or "").partition("::msg::dds_::")
             if name and endpoint.topic_name.startswith("rt/"):
                 types = topics.setdefault(endpoint.topic_name[2:], {})
-                kind, policy = f"{package}/msg/{name[:-1]}", endpoint.qos[Policy.Reliability]
-                types[kind] = types.get(kind, True) and isinstance(policy, Policy.Reliability.Reliable)
+                kind, policy = f"{package}/msg/{name[:-1]}", endpoint.qos[reliability]
+                types[kind] = types.get(kind, True) and isinstance(policy, reliability.Reliable)
         return topics
 
     def reader(self, topic: str, message_type: str, *, reliable: bool, latched: bool = False) -> Any:
         """Return a reader, `reliable` if all publishers are: else it matches none of the others. `latched`: they keep their last message."""
-        from cyclonedds.sub import DataReader  # noqa: PLC0415 - an extra
-
         qos = _qos(_QUEUED, reliable=reliable, latched=latched)
-        return DataReader(self._participant, self._topic(topic, message_type), qos=qos)
+        return _cyclonedds().sub.DataReader(self._participant, self._topic(topic, message_type), qos=qos)
 
     def publish(self, topic: str, message: Any, *, encoded: bytes = b"", latched: bool = False) -> None:
         """Publish a message of rosbags; `latched`: later subscribers get the last one, too."""
-        from cyclonedds.pub import DataWriter  # noqa: PLC0415 - an extra
-
         if topic not in self._writers:
             at = self._topic(topic, message.__msgtype__)
             qos = _qos(1 if latched else _QUEUED, reliable=True, latched=latched)
-            self._writers[topic] = DataWriter(self._participant, at, qos=qos)
+            self._writers[topic] = _cyclonedds().pub.DataWriter(self._participant, at, qos=qos)
         writer = self._writers[topic]
         writer.write(writer.data_type(encoded or encode(message)))
 
     def _topic(self, name: str, message_type: str) -> Any:
-        from cyclonedds.topic import Topic  # noqa: PLC0415 - an extra
+        return _cyclonedds().topic.Topic(self._participant, f"rt{name}", _dds_type(message_type))
 
-        return Topic(self._participant, f"rt{name}", _dds_type(message_type))
+
+@cache
+def _cyclonedds() -> Any:
+    """Import an extra, with those of its modules that are used here."""
+    found = require("rosbags", "cyclonedds", what="topics of ROS 2 need")
+    for name in ("builtin", "core", "domain", "idl", "pub", "qos", "sub", "topic"):
+        import_module(f"cyclonedds.{name}")
+    return found
 
 
 def _qos(depth: int, *, reliable: bool, latched: bool) -> Any:
-    from cyclonedds.qos import Policy, Qos  # noqa: PLC0415 - an extra
-
-    return Qos(
-        Policy.Reliability.Reliable(10**8) if reliable else Policy.Reliability.BestEffort,
-        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-        Policy.History.KeepLast(depth),
-        Policy.DataRepresentation(use_cdrv0_representation=True),
-        Policy.IgnoreLocal.Participant,
+    policy = _cyclonedds().qos.Policy
+    return _cyclonedds().qos.Qos(
+        policy.Reliability.Reliable(10**8) if reliable else policy.Reliability.BestEffort,
+        policy.Durability.TransientLocal if latched else policy.Durability.Volatile,
+        policy.History.KeepLast(depth),
+        policy.DataRepresentation(use_cdrv0_representation=True),
+        policy.IgnoreLocal.Participant,
     )
 
 
@@ -119,9 +119,8 @@ def _dds_type(message_type: str) -> Any:
 
     Its instances hold the bytes of a message, which rosbags encodes and decodes, as those in bags.
     """
-    from cyclonedds import idl  # noqa: PLC0415 - an extra
-
-    types: Any = idl.types
+    idl = _cyclonedds().idl
+    types = idl.types
 
     def hint(kind: int, of: Any) -> Any:
         if kind == _BASIC:
@@ -177,11 +176,6 @@ class _RecentTrack(Track):
     @property
     def constant(self) -> bool:
         return self.static
-
-
-class _Unlogged(Notes):
-    def add(self, line: str) -> None:
-        self.lines.append(line)
 
 
 class _Known(NamedTuple):
@@ -292,7 +286,7 @@ class Subscription:
             return self._latest
 
     def _derive(self) -> _Known:
-        request, name = replace(self._request, notes=_Unlogged()), self._request.pose_topic
+        request, name = replace(self._request, notes=Notes(logged=False)), self._request.pose_topic
         tree, topics = self._tracks.tree(request), self._tracks.by_topic
         frames = [*self._frames.values(), ""]
         sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
