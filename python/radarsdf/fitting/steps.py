@@ -25,8 +25,7 @@ from radarsdf.field.field import NeuralField, VertexFeatures, cells_width, fouri
 from radarsdf.fitting.sampling import Batch, Dropout
 from radarsdf.threads import ThreadPool
 
-# Dropout of the features and of the Fourier encoding before the intensity network, scaled by n / (n + 2.5) if the training
-# uses each sample n times: the more often a sample is used, the more easily the network memorises it.
+# Dropout of the features and of the Fourier encoding before the intensity network, times `Schedule.dropout_scale`.
 FEATURE_DROPOUT, FOURIER_DROPOUT = 0.85, 0.25
 # Samples in a part. Smaller parts balance better among threads and fit the cache, but each prepares the networks again:
 # for a joint batch of 4096 samples, 4, 8 and 16 parts took 1.02, 1.07 and 1.16 times as long as two.

@@ -22,7 +22,7 @@ from radarsdf.threads import ThreadPool, resolve_num_threads, start_vector_libra
 _FEW, _VERTICES = 1 << 13, 1 << 17  # places evaluated without a pool of threads; by one thread at a time
 
 # Clutter ratio from which on a scene counts as fully rough.
-# Measured: 0 to 0.07 on simulated scenes without much clutter, 0.27 to 0.44 on five real drives.
+# Measured: 0 to 0.07 on simulated scenes without much clutter, with all scans or few, 0.27 to 0.44 on five real drives.
 _ROUGH_CLUTTER_RATIO = 0.27
 # Floor of the uncertainty, leaf cells, which more returns do not reduce: in smooth scenes, and its increase in rough ones,
 # where consistent returns may share an error. Tuned with `python -m bench.paper calibration`: errors are within 95 %

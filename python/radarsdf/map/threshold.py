@@ -58,9 +58,7 @@ class Threshold:
 
     min_confidence: float  # in [0, 1]; surface below it is left out
     expected_precision: float  # expected true share of the kept area; 0 if nothing is kept
-    # Expected share of the observed surface, the one with returns, that the mesh covers; 0 if there is none. Surface that no
-    # ray reached does not count: the share of the whole scene may be far smaller.
-    coverage_of_observed: float
+    coverage_of_observed: float  # expected share of the surface with returns that is kept; 0 if there is none
     whole_precision: float  # the same two if all surface were kept, regardless of its confidence
     whole_coverage_of_observed: float
 

@@ -320,7 +320,6 @@ def _lane(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
 def _drive(
     name: str, site: Site, path: Path, seed: int, frames: int | None, look_at: Floats | None = None
 ) -> Simulation:
-    """Scan a site along a path."""
     sensor, scans, height_m = _DRIVES[name]
     count = scans if frames is None else whole_number(frames, "frames", 1)
     rng = generator(seed, _TRAJECTORY)
