@@ -8,9 +8,10 @@ import trimesh
 from numpy.typing import NDArray
 from radarsdf._core import cell_keys
 from radarsdf.evaluation import surface_metrics
+from radarsdf.returns.sensor import Sensor
 from radarsdf.simulate import Scene as World
 from radarsdf.simulate import Simulation
-from radarsdf.simulate.radar import generator, unit_vectors
+from radarsdf.simulate.radar import generator
 from scipy.spatial import cKDTree
 
 from scenes.scene import Scene
@@ -149,7 +150,7 @@ def filled_truth(simulation: Simulation) -> FloatArray:
         for is_last in (False, True):
             u = half * (2 * (rays + rng.random(rays.shape)) / shape - 1)
             angles = np.stack([u[:, 0], np.arcsin(u[:, 1])], axis=1)
-            directions = unit_vectors(angles) @ T_world_sensor[:3, :3].T
+            directions = Sensor.directions(*angles.T) @ T_world_sensor[:3, :3].T
             hits = simulation.scene.raycast(origin, directions, sensor.max_range_m)
             detected = sensor.echo_power_db(simulation.scene, origin, directions, hits) >= sensor.threshold_db
             rows = np.flatnonzero(detected & (hits.range_m >= sensor.min_range_m))

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from numpy.testing import assert_array_equal
 from radarsdf.io.npz import write_scans
+from radarsdf.returns.sensor import Sensor
 from radarsdf.scans import Scans
 from radarsdf.simulate import Box, Pole, Terrain, materials
 from radarsdf.simulate import Scene as World
-from radarsdf.simulate.radar import unit_vectors
 from scipy.spatial import cKDTree
 
 from bench.truth import along_normals, filled_truth, score_without_holes, to_planes, truth_of
@@ -149,7 +149,7 @@ def test_the_filled_truth_has_no_holes_on_detectable_surface(wall):
         simulation.sensor.azimuth_fov_rad,
         simulation.sensor.elevation_fov_rad,
     ]
-    directions = unit_vectors(angles) @ T[:3, :3].T
+    directions = Sensor.directions(*angles.T) @ T[:3, :3].T
     hits = simulation.scene.raycast(T[:3, 3], directions, simulation.sensor.max_range_m)
     detected = (
         simulation.sensor.echo_power_db(simulation.scene, T[:3, 3], directions, hits)

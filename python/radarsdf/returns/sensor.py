@@ -103,7 +103,8 @@ class Sensor:
         gain, offset = self.unit
         return intensities if self.unit == SAME_UNIT else gain * intensities + offset
 
-    def directions(self, azimuth_rad: Array, elevation_rad: Array) -> Floats:
+    @staticmethod
+    def directions(azimuth_rad: Array, elevation_rad: Array) -> Floats:
         """Convert azimuths and elevations (N,), rad, to unit vectors (N, 3), float64, in the sensor frame."""
         x, y = np.cos(azimuth_rad), np.sin(azimuth_rad)
         cosine = np.cos(elevation_rad)

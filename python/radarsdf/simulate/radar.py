@@ -12,6 +12,7 @@ from scipy.special import gammaincinv
 
 from radarsdf.arrays import Bools, Floats, Floats32, Ints
 from radarsdf.checks import check, check_poses, instance, whole_number
+from radarsdf.returns.sensor import Sensor
 from radarsdf.settings import settings
 
 from .world import Hits, Scene
@@ -136,7 +137,7 @@ class RadarSensor:
         """
         angles = self._beam_angles(generator(seed, frame, _BEAMS))
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
-        directions = unit_vectors(angles) @ R.T
+        directions = Sensor.directions(*angles.T) @ R.T
         rays = _Rays(origin, directions, angles, scene.raycast(origin, directions, self.max_range_m))
         surface = self._surface(scene, rays, generator(seed, frame, _SPECKLE))
         candidates = {
@@ -254,19 +255,12 @@ class RadarSensor:
         if self.step_db > 0:
             power = np.round(power / self.step_db) * self.step_db
         rows = (power >= self.threshold_db) & (range_m >= self.min_range_m) & (range_m <= self.max_range_m)
-        points = range_m[rows, None] * unit_vectors(angles[rows])
+        points = range_m[rows, None] * Sensor.directions(*angles[rows].T)
         intensities = np.clip(power[rows], self.floor_db, self.saturation_db).astype(np.float32)
         noiseless = np.broadcast_to(echoes.noiseless_db, rows.shape)[rows]
         noiseless = np.clip(noiseless, self._least_db, self.saturation_db).astype(np.float32)
         kinds = np.full(len(points), kind, dtype=np.int8)
         return SimulatedScan(points.astype(np.float32), intensities, noiseless, kinds)
-
-
-def unit_vectors(angles: Floats) -> Floats:
-    """Unit vectors (N, 3), sensor frame, of azimuths and elevations (N, 2), rad."""
-    azimuth, elevation = angles[:, 0], angles[:, 1]
-    cos = np.cos(elevation)
-    return np.stack([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
 def _hash(cells: Ints, key: int) -> Floats:
@@ -325,7 +319,8 @@ class Simulation:
         every = max(1, len(self.lidar_poses) // 40)  # neighbouring poses see the same surfaces
         for T_world_sensor in self.lidar_poses[::every]:
             angles = sensor.angles(rng.random((_LIDAR_RAYS, 2)))
-            directions, origin = unit_vectors(angles) @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
+            R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
+            directions = Sensor.directions(*angles.T) @ R.T
             hits = self.scene.raycast(origin, directions, sensor.max_range_m)
             visible = sensor.echo_power_db(self.scene, origin, directions, hits) >= sensor.threshold_db
             visible &= hits.range_m >= sensor.min_range_m
