@@ -99,24 +99,24 @@ def test_vertices_are_right_to_a_tenth_of_a_millimetre(tmp_path, suffix):
     np.testing.assert_allclose(vertices, np.asarray(mesh.triangles).reshape(-1, 3), atol=1e-4)
 
 
-def test_a_mesh_without_triangles_is_refused_as_glb(tmp_path):
+def test_a_mesh_without_triangles_is_refused_as_glb_alone(tmp_path):
     empty = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int), process=False)
+    empty.visual.vertex_colors = np.zeros((0, 4), np.uint8)
     with pytest.raises(ValueError, match="no triangle"):
         write_mesh(tmp_path / "empty.glb", empty)
     assert not list(tmp_path.iterdir())
+    write_mesh(tmp_path / "empty.ply", empty)
 
 
 def test_ply_keeps_attributes_colours_and_faces(tmp_path):
     mesh = sphere()
-    mesh.visual = trimesh.visual.ColorVisuals(
-        mesh, vertex_colors=np.arange(4 * len(mesh.vertices)).reshape(-1, 4) % 256
-    )
+    colors = np.arange(4 * len(mesh.vertices)).reshape(-1, 4) % 256
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
     write_mesh(tmp_path / "mesh.ply", mesh)
     read = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
     np.testing.assert_array_equal(read.vertices, mesh.vertices)  # to the bit
     np.testing.assert_array_equal(read.faces, mesh.faces)
     np.testing.assert_array_equal(read.visual.vertex_colors, mesh.visual.vertex_colors)
-    header = (tmp_path / "mesh.ply").read_bytes()[:500]
-    assert b"property double x" in header
+    assert b"property double x" in (tmp_path / "mesh.ply").read_bytes()[:500]
     confidence = read.metadata["_ply_raw"]["vertex"]["data"]["confidence"].ravel()
     np.testing.assert_array_equal(confidence, mesh.vertex_attributes["confidence"])

@@ -142,7 +142,8 @@ def _scalars_and_colors(mesh: "trimesh.Trimesh") -> tuple[Columns, Bytes | None]
     """Scalar attributes (V,) float32 by name, and sRGB colours (V, 4), if there are any, of the vertices."""
     attributes, visual = mesh.vertex_attributes.items(), cast(Any, mesh.visual)
     scalars = {n: np.asarray(v, np.float32) for n, v in attributes if np.shape(v) == (len(mesh.vertices),)}
-    return scalars, np.asarray(visual.vertex_colors, np.uint8) if visual.kind == "vertex" else None
+    has_colors = visual.kind == "vertex" and len(mesh.vertices)  # of none, trimesh returns (0, 5)
+    return scalars, np.asarray(visual.vertex_colors, np.uint8) if has_colors else None
 
 
 def _glb(mesh: "trimesh.Trimesh") -> bytes:
