@@ -116,6 +116,8 @@ def write_report(path: AnyPath, subject: Subject) -> int:
     require_extras()
     report = subject.radar_map.report
     settings, defaults = (flat_settings(of.to_dict()) for of in (subject.radar_map.config, FitConfig()))
+    of_surface = {"surface": surface_values, "errors": error_values, "uncertainty": uncertainty_values}
+    has_surface = len(subject.mesh.faces) != 0
     return _write_page(
         path,
         "report.html",
@@ -123,9 +125,7 @@ def write_report(path: AnyPath, subject: Subject) -> int:
         report=report,
         fit_s=sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s"),
         poses=pose_values(report.get("poses")),
-        surface=surface_values(subject),
-        errors=error_values(subject),
-        uncertainty=uncertainty_values(subject),
+        **{name: values(subject) if has_surface else None for name, values in of_surface.items()},
         intensity=intensity_values(subject),
         changed=[(n, value, defaults[n]) for n, value in settings.items() if value != defaults[n]],
         toml=to_toml(subject.radar_map.config),
@@ -150,11 +150,9 @@ def write_changes_report(
     return _write_page(path, "changes.html", names=names, surface=surface, key=MEANING, **values)
 
 
-def surface_values(subject: Subject) -> dict[str, Any] | None:
-    """Values of the surface section, or None if there is no surface."""
+def surface_values(subject: Subject) -> dict[str, Any]:
+    """Values of the surface section."""
     mesh, _ = subject.shown
-    if len(mesh.faces) == 0:
-        return None
     colors, legend = _colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
     origin = subject.radar_map.origin
     sensors = None if subject.scans is None else subject.scans.sensor_poses[:, :3, 3] - origin
@@ -163,9 +161,9 @@ def surface_values(subject: Subject) -> dict[str, Any] | None:
 
 
 def error_values(subject: Subject) -> dict[str, Any] | None:
-    """Values of the section of surface errors, or None without a truth or a surface."""
+    """Values of the section of surface errors, or None without a truth."""
     truth, mesh = subject.ground_truth, subject.mesh
-    if truth is None or len(mesh.faces) == 0:
+    if truth is None:
         return None
     metrics = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
     shown_m, _ = subject.truth_tree.query(subject.shown[0].vertices, workers=resolve_num_threads(0))
@@ -173,11 +171,9 @@ def error_values(subject: Subject) -> dict[str, Any] | None:
     return {"metrics": metrics, **pictured}
 
 
-def uncertainty_values(subject: Subject) -> dict[str, Any] | None:
-    """Values of the uncertainty section, or None if there is no surface."""
+def uncertainty_values(subject: Subject) -> dict[str, Any]:
+    """Values of the uncertainty section."""
     mesh, (shown, _) = subject.mesh, subject.shown
-    if len(mesh.faces) == 0:
-        return None
     sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
     shown_m, percentiles = shown.vertex_attributes["uncertainty_m"], [10, 50, 90]
     return {
