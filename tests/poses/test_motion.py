@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
-from radarsdf.poses.motion import Motion, MotionPrior, MotionRate
+from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, SteadyMotion
 from radarsdf.poses.rigid import moved, steps, transform
 from radarsdf.simulate import drifted
 
@@ -51,6 +51,14 @@ def test_standard_deviations_and_bias_are_estimated_from_known_poses():
 
 TURNS = MotionPrior(np.array([0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.15]), True)
 MOVES = MotionPrior(np.array([20.0, 10.0, 5.0]), np.array([2.0, 1.0, 0.5]), False)
+
+
+def test_two_radars_that_measure_at_once_do_not_slow_the_steps_around():
+    times_s = np.array([0.0, 0.0, 0.1, 0.15, 0.15, 0.2, 0.3, 0.3])
+    poses = transform(np.outer(times_s, [0.0, 0.0, 1.0]), np.outer(times_s, [0.0, 0.0, 2.0]))
+    prior = MotionPrior(np.full(3, 1e6), np.ones(3), True)
+    motion = SteadyMotion.by((prior, prior), np.ones(2), times_s, poses, np.zeros(6, bool))
+    assert abs(motion.errors(poses)).max() < 1e-4
 
 
 @pytest.mark.parametrize("habits", [TURNS, MOVES], ids=["turns", "moves"])

@@ -8,7 +8,7 @@ import numpy as np
 from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
-from radarsdf.poses.motion import Motion, MotionRate, interpolate, spans_of, usual_duration_s, way
+from radarsdf.poses.motion import LEAST_S, Motion, MotionRate, interpolate, spans_of, usual_duration_s, way
 from radarsdf.poses.rigid import rotation_vector, skew, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import (
@@ -23,7 +23,7 @@ from radarsdf.rig import Rig
 LEAST_MPS = 0.02
 # Prior deviation of the vertical velocity, share of the speed, where Doppler is less precise. Slopes of roads: 0.05.
 _CLIMB = 0.1
-_LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
+LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
 # Systematic error of all velocities of a drive in any direction, share of the speed: by the axes and the scale of the radar.
 # Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
 _IN_COMMON = 0.003
@@ -170,12 +170,12 @@ class DopplerMotion(Motion):
         turns = step_vectors(poses)[:, 3:] if turns is None else turns
         ways = velocities.step_covariances(durations_s)
         shares = np.full((len(durations_s), 6), np.inf)
-        shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
+        shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), LEAST_STEP_M**2)
         # A change of the turn rate bends the way: at constant angular acceleration, by a twelfth of the change in a step.
         timed = durations_s > 0  # else, two radars measured at once
         rates, each_s = turns[timed] / durations_s[timed, None], durations_s[timed]
         weights = np.square(np.minimum(each_s[1:], each_s[:-1]))
-        bends_rad2_s2 = weights @ np.square(np.diff(rates, axis=0) / 12) / max(weights.sum(), _LEAST_S**2)
+        bends_rad2_s2 = weights @ np.square(np.diff(rates, axis=0) / 12) / max(weights.sum(), LEAST_S**2)
         shares[:, :3] += np.square(skew(velocities.mean_mps[:-1])) @ bends_rad2_s2 * durations_s[:, None] ** 4
         spans = spans_of(times_s)
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
@@ -202,7 +202,6 @@ class DopplerMotion(Motion):
 
 
 _ANY_MPS, _TURN_RAD_S = 100.0, 0.3  # prior deviations of a component of a velocity and of a turn rate
-_LEAST_S = 1e-6  # of a step, against division by zero
 
 
 @dataclass(frozen=True)
@@ -225,7 +224,7 @@ class BodyVelocities(SensorVelocities):
         """Build from the scans (N,) of each radar with Doppler and its velocities at them. `times_s` (F,): of all scans."""
         count, mountings = len(rig.of_scan), rig.mountings
         mean, covariance = np.zeros((count, 3)), np.tile(_ANY_MPS**2 * np.eye(3), (count, 1, 1))
-        durations_s, middles_s = np.maximum(np.diff(times_s), _LEAST_S), (times_s[:-1] + times_s[1:]) / 2
+        durations_s, middles_s = np.maximum(np.diff(times_s), LEAST_S), (times_s[:-1] + times_s[1:]) / 2
         of_radars_mps, variances, changes = [], [], []
         for rows, velocities in measured:
             R, own_s = mountings[rows[0], :3, :3], times_s[rows]

@@ -15,6 +15,7 @@ _SPAN = 4.0  # width of a search, standard deviations
 _FEWEST, _MOST = 64, 8192  # limits of the number of poses of a search
 _AT_ONCE = 1e-3  # duration of a step between two radars that measure at the same time, median steps
 _LEAST_SPAN = 0.1  # minimum duration of a step, median steps: two scans at the same time may still differ
+LEAST_S = 1e-6  # of a step, against division by zero
 _YAW = 5  # component of a step
 _NO_LEVER = np.zeros((3, 3))
 _LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # minimum deviations, below the resolution of any radar
@@ -264,17 +265,24 @@ class SteadyMotion(Motion):
         spans = spans_of(times_s)
         duration_s = usual_duration_s(np.diff(times_s))
         shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
-        motion = cls(steps(poses), shares, spans, priors, duration_s * spans, duration_s**2 * usual)
+        motion = cls(
+            steps(poses), shares, spans, priors, np.maximum(np.diff(times_s), LEAST_S), duration_s**2 * usual
+        )
         return motion.updated(poses)
 
     def updated(self, poses: Floats, *_: Floats) -> Self:
         """Predict each step of `poses` from its neighbours."""
-        durations_s = self.durations_s
-        rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)
-        both = [p.conditional(r, durations_s) for p, r in zip(self.priors, rates, strict=True)]
+        durations_s = self.durations_s[:, None]
+        # Between radars that measure almost at once, no rate is measured: that of the step before holds. As rates of 0, such steps
+        # bent both ends of the drives of rigs of three by up to 5 degrees.
+        timed = self.durations_s >= _LEAST_SPAN * usual_duration_s(self.durations_s)
+        vectors, own_s = step_vectors(poses)[timed], self.durations_s[timed]
+        rates = np.split(vectors / own_s[:, None], 2, axis=1)
+        both = [p.conditional(r, own_s) for p, r in zip(self.priors, rates, strict=True)]
+        measured = np.maximum(np.cumsum(timed) - 1, 0)  # row of `rates` for each step
         # Damped by half at twice the information: the same gradient, but steps that move together do not overshoot.
-        moves, turns = (0.5 * durations_s[:, None] * (r + m) for r, (m, _) in zip(rates, both, strict=True))
-        variances = np.concatenate([v for _, v in both], axis=1) * 0.5 * durations_s[:, None] ** 2
+        moves, turns = (0.5 * durations_s * (r + m)[measured] for r, (m, _) in zip(rates, both, strict=True))
+        variances = np.concatenate([v for _, v in both], axis=1)[measured] * 0.5 * durations_s**2
         variances = np.maximum(variances, np.repeat([_LEAST_M**2, _LEAST_RAD**2], 3))
         shares = np.where(np.isinf(self.shares), np.inf, variances)
         return replace(self, steps=transform(turns, moves), shares=shares)
