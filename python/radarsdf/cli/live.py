@@ -157,9 +157,7 @@ def live(given: Namespace, results: Results) -> None:
             shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
             paced = {"rate": given.rate, "on_scan": shown, "stopped": stopped}
             done = replay(growing, scans, with_poses=not unposed, **paced)
-        _add_rates(results, done)
-        if not growing.sealed_scans and len(growing.close_loops()):
-            results.add("loops of the trajectory closed")
+        _conclude(results, done, growing)
         if out is not None:
             made = growing.map() if given.quick else growing.finish(progress=results.progress)
             made.save(out)
@@ -231,8 +229,8 @@ class _Shown:
             began_s = time.monotonic()
             if final:
                 self._read_path()
-            elif began_s >= self._next_loop_s and not self._map.sealed_scans:
-                self._closed |= len(self._map.close_loops()) > 0
+            elif began_s >= self._next_loop_s:
+                self._closed |= _close_loops(self._map)
                 self._next_loop_s = time.monotonic() + (time.monotonic() - began_s) / _LOOP_SHARE
             mesh, path, time_s = self._map.mesh(), np.array([*self._path.values()]), self._time_s
             for sink in self._sinks if len(mesh.faces) else ():
@@ -247,7 +245,12 @@ class _Shown:
                 self._next_grid_s = time.monotonic() + (time.monotonic() - began_s) / _GRID_SHARE
 
 
-def _add_rates(results: Results, done: Replay) -> None:
+def _close_loops(live_map: LiveMap) -> bool:
+    return not live_map.sealed_scans and len(live_map.close_loops()) > 0
+
+
+def _conclude(results: Results, done: Replay, live_map: LiveMap) -> None:
+    """Add counts and times, and close the loops of the map."""
     check(done.integrated, "; ".join(["no scan was integrated into the map", *done.notes]))
     scans = done.integrated + done.dropped + done.lost
     line = f"{done.integrated} of {scans} scans in the map, {done.dropped} dropped, {done.lost} lost"
@@ -258,3 +261,5 @@ def _add_rates(results: Results, done: Replay) -> None:
     named = zip(("median", "99th percentile", "worst"), values.values(), strict=True)
     took = ", ".join(f"{1e3 * took_s:.1f} ms ({name})" for name, took_s in named)
     results.add(f"a scan took {took}: {hertz:.0f} scans per second", **values, scans_per_second=hertz)
+    if _close_loops(live_map):
+        results.add("loops of the trajectory closed")

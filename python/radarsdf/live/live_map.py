@@ -6,6 +6,7 @@ import threading
 import weakref
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -311,12 +312,7 @@ class LiveMap:
             alike = state.with_intensities in (None, with_intensities)
             check(alike, "either all scans have intensities, or none has")
             steps = [] if given is not None else self._follower.seek(state.track, state.log, scan_id, scan)
-            # The first scan defines the world.
-            known: dict[str, Any] = {"tracked": len(state.log) > 0}
-            come = {
-                step.scan_id: dataclasses.replace(step.logged, pose=step.found.pose, **known)
-                for step in steps
-            }
+            come = {step.scan_id: dataclasses.replace(step.logged, pose=step.found.pose) for step in steps}
             if given is not None:
                 come[scan_id] = dataclasses.replace(scan, pose=given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
@@ -382,17 +378,18 @@ class LiveMap:
         with self._owned():
             self._check_unsealed()
             log = self._state.log
-            timed = [row for row in log.trajectory() if row[2] is not None]
-            timed.sort(key=lambda row: row[2] or 0.0)
-            ids, tracked = [scan_id for scan_id, *_ in timed], np.array([row[3] for row in timed], bool)
-            poses = np.array([pose for _, pose, *_ in timed]).reshape(-1, 4, 4)
-            some = [log.get(scan_id).static.points for scan_id in ids[:: 1 + len(ids) // _RANGED]]
-            if not tracked.any() or not any(visits(median_range_m(some), poses)):
+            timed = sorted((row for row in log.trajectory() if row[2] is not None), key=itemgetter(2))
+            if not any(tracked for *_, tracked in timed):
                 return NO_KEYS
-            drive = self._drive([log.get(i) for i in ids], poses, times_s=np.array([row[2] for row in timed]))
-        fixed = ~tracked if not tracked.all() else np.arange(len(ids)) == 0
+            ids, given, times_s, tracked = zip(*timed, strict=True)
+            some, poses = ids[:: 1 + len(ids) // _RANGED], np.stack(given)
+            range_m = median_range_m([log.get(scan_id).static.points for scan_id in some])
+            if not any(visits(range_m, poses)):
+                return NO_KEYS
+            drive = self._drive([*map(log.get, ids)], poses, times_s=np.array(times_s))
+        fixed = np.arange(len(ids)) == 0 if all(tracked) else ~np.array(tracked)
         refined = refine_poses(drive, fixed=fixed, config=self.config, progress=False)
-        last = int(np.flatnonzero(~fixed)[-1])
+        last = np.flatnonzero(~fixed)[-1]
         T = refined.poses[last] @ np.linalg.inv(poses[last])
         with self._owned():
             now = self._state.log

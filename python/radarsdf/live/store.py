@@ -184,7 +184,10 @@ class ScanLog:
         stored = self._rows.read(columns, self._end) if self._stored else []
         stored = [row for row in stored if row[0] not in self._gone]
         return [
-            *((scan_id, _pose_of(pose), time_s, bool(tracked)) for _, scan_id, pose, time_s, tracked in stored),
+            *(
+                (scan_id, _pose_of(pose), time_s, bool(tracked))
+                for _, scan_id, pose, time_s, tracked in stored
+            ),
             *((scan_id, scan.pose, scan.time_s, scan.tracked) for scan_id, scan in self._scans.items()),
         ]
 
@@ -396,6 +399,6 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
                     check_values_of_scan(array, points, name, 0)
                 check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
             mounted = radars[k] if radars else None
-            known = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}
+            known: dict[str, Any] = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}
             scans.append(LoggedScan(check_pose(pose, "pose"), **held, **known))
         return described, scans, _sums_of(arrays)
