@@ -33,7 +33,6 @@ from radarsdf.view.sinks import Ros2Sink, Sink, foxglove_sink, rerun_sink
 
 _SHOWN_EVERY_S = 0.5
 _GRID_SHARE = 0.05  # share of the time spent on free space, for which a map is fitted anew
-_LOOP_SHARE = 0.2  # and on loops, for which the poses are re-estimated
 _MAX_VOXELS = 500_000
 _MAX_PATH = 2000  # positions of the trajectory shown
 _TIMED = 10_000  # last scans whose durations are reported
@@ -199,8 +198,7 @@ class _Shown:
         self._path: dict[ScanId, Floats] = {}  # positions of every n-th scan
         self._every, self._scans, self._time_s = 1, 0, 0.0
         self._thread, self._lock = threading.Thread(), threading.Lock()
-        self._next_s, self._next_grid_s, self._next_loop_s = 0.0, 0.0, 0.0
-        self._closed = False  # whether loops were closed since the positions were read
+        self._next_s, self._next_grid_s = 0.0, 0.0
 
     def __call__(self, scan: Scan, found: Integrated) -> None:
         T = found.pose if self._mountings is None else found.pose @ self._mountings[scan.sensor]
@@ -209,8 +207,8 @@ class _Shown:
             sink.show_scan(scan, self._time_s)
         if self._scans % self._every == 0:
             self._path = self._path | {found.scan_id: found.pose[:3, 3]}
-        if found.moved or self._closed:
-            self._read_path()
+        for scan_id in self._path.keys() & set(found.moved):
+            self._path[scan_id] = self._map.pose(scan_id)[:3, 3]
         if len(self._path) > _MAX_PATH:
             self._path, self._every = dict([*self._path.items()][::2]), 2 * self._every
         self._scans += 1
@@ -219,19 +217,11 @@ class _Shown:
             self._thread = threading.Thread(target=self.show, daemon=True)
             self._thread.start()
 
-    def _read_path(self) -> None:
-        self._closed = False
-        poses = dict(zip(self._map.scan_ids, self._map.trajectory()[1], strict=True))
-        self._path = {scan_id: poses[scan_id][:3, 3] for scan_id in self._path if scan_id in poses}
-
     def show(self, final: bool = False) -> None:
         with self._lock:
-            began_s = time.monotonic()
-            if final:
-                self._read_path()
-            elif began_s >= self._next_loop_s:
-                self._closed |= _close_loops(self._map)
-                self._next_loop_s = time.monotonic() + (time.monotonic() - began_s) / _LOOP_SHARE
+            if final:  # loops may have been closed
+                known = zip(self._map.scan_ids, self._map.trajectory()[1], strict=True)
+                self._path = {scan_id: pose[:3, 3] for scan_id, pose in known if scan_id in self._path}
             mesh, path, time_s = self._map.mesh(), np.array([*self._path.values()]), self._time_s
             for sink in self._sinks if len(mesh.faces) else ():
                 sink.show_surface(mesh, path, time_s)
@@ -243,10 +233,6 @@ class _Shown:
                 for sink in self._sinks:
                     sink.show_grid(grid, time_s)
                 self._next_grid_s = time.monotonic() + (time.monotonic() - began_s) / _GRID_SHARE
-
-
-def _close_loops(live_map: LiveMap) -> bool:
-    return not live_map.sealed_scans and len(live_map.close_loops()) > 0
 
 
 def _conclude(results: Results, done: Replay, live_map: LiveMap) -> None:
@@ -261,5 +247,5 @@ def _conclude(results: Results, done: Replay, live_map: LiveMap) -> None:
     named = zip(("median", "99th percentile", "worst"), values.values(), strict=True)
     took = ", ".join(f"{1e3 * took_s:.1f} ms ({name})" for name, took_s in named)
     results.add(f"a scan took {took}: {hertz:.0f} scans per second", **values, scans_per_second=hertz)
-    if _close_loops(live_map):
+    if not live_map.sealed_scans and len(live_map.close_loops()):
         results.add("loops of the trajectory closed")
