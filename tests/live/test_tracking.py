@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
+from radarsdf.live import live_map
 from radarsdf.live.tracking import Lost
 from radarsdf.poses.rigid import aligned
 
@@ -180,3 +181,37 @@ def test_the_next_scan_is_placed_relative_to_moved_scans(drive, tmp_path):
     live.remove("bad")
     done = follow(live, scans, motion, [9])
     assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[9])[:3, 3]) < 0.1
+
+
+def test_a_loop_is_closed_and_tracking_continues(tmp_path):
+    """The lap ended 0.56 m off."""
+    lap = KINDS["hall"](seed=2)
+    motion, refine = radarsdf.simulate.measured_motion(lap, seed=2), live_map.refine_poses
+    live = LiveMap(SETTINGS, folder=tmp_path / "folder")
+
+    def end_m(one):
+        off = lap.poses[0] @ np.linalg.inv(one.pose(0)) @ one.pose(one.scan_ids[-1]) - lap.poses[len(one) - 1]
+        return np.linalg.norm(off[:3, 3])
+
+    def refine_meanwhile(*scans, **options):
+        follow(live, lap, motion, [79])
+        return refine(*scans, **options)
+
+    follow(live, lap, motion, range(50))
+    assert len(live.close_loops()) == 0  # no place was revisited
+    follow(live, lap, motion, range(50, 79))
+    live.save(tmp_path / "live.npz")
+    loaded, first = LiveMap.load(tmp_path / "live.npz"), live.pose(0)
+    assert end_m(live) > 0.3
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(live_map, "refine_poses", refine_meanwhile)
+        assert len(live.close_loops()) > 1000
+    loaded.close_loops()
+    follow(loaded, lap, motion, [79])
+    for one in (live, loaded):
+        assert end_m(one) < 0.1
+        assert (one.pose(0) == first).all()
+    kept = {i: lap.poses[0] @ live.pose(i) for i in live.scan_ids}
+    live.move_all(kept)  # poses given by the user
+    assert len(live.close_loops()) == 0
+    assert all((live.pose(i) == pose).all() for i, pose in kept.items())

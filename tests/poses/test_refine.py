@@ -315,3 +315,11 @@ def test_the_faces_of_a_wall_do_not_attract_each_other():
     steps = np.tile(np.eye(6), (10, 1, 1)), np.zeros((9, 6, 6)), np.zeros((10, 6))
     moved = planes.solve(*steps, 1e-6, 100, False, 1)[0][:, 0]
     assert abs(moved[::2] - moved[1::2]).max() < 0.01
+
+
+def test_fixed_poses_are_kept():
+    wall = radarsdf.simulate.wall(frames=6)
+    given, fixed = drifted(wall.poses, 0.1, 0.01, 1), np.arange(6) == 2
+    refined = radarsdf.refine_poses(wall.points, given, fixed=fixed)
+    assert refined.improved
+    assert ((refined.poses == given).all(axis=(1, 2)) == fixed).all()

@@ -156,7 +156,7 @@ def live(given: Namespace, results: Results) -> None:
             shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
             paced = {"rate": given.rate, "on_scan": shown, "stopped": stopped}
             done = replay(growing, scans, with_poses=not unposed, **paced)
-        _add_rates(results, done)
+        _conclude(results, done, growing)
         if out is not None:
             made = growing.map() if given.quick else growing.finish(progress=results.progress)
             made.save(out)
@@ -219,6 +219,9 @@ class _Shown:
 
     def show(self, final: bool = False) -> None:
         with self._lock:
+            if final:  # loops may have been closed
+                known = zip(self._map.scan_ids, self._map.trajectory()[1], strict=True)
+                self._path = {scan_id: pose[:3, 3] for scan_id, pose in known if scan_id in self._path}
             mesh, path, time_s = self._map.mesh(), np.array([*self._path.values()]), self._time_s
             for sink in self._sinks if len(mesh.faces) else ():
                 sink.show_surface(mesh, path, time_s)
@@ -232,7 +235,8 @@ class _Shown:
                 self._next_grid_s = time.monotonic() + (time.monotonic() - began_s) / _GRID_SHARE
 
 
-def _add_rates(results: Results, done: Replay) -> None:
+def _conclude(results: Results, done: Replay, live_map: LiveMap) -> None:
+    """Add counts and times, and close the loops of the map."""
     check(done.integrated, "; ".join(["no scan was integrated into the map", *done.notes]))
     scans = done.integrated + done.dropped + done.lost
     line = f"{done.integrated} of {scans} scans in the map, {done.dropped} dropped, {done.lost} lost"
@@ -243,3 +247,5 @@ def _add_rates(results: Results, done: Replay) -> None:
     named = zip(("median", "99th percentile", "worst"), values.values(), strict=True)
     took = ", ".join(f"{1e3 * took_s:.1f} ms ({name})" for name, took_s in named)
     results.add(f"a scan took {took}: {hertz:.0f} scans per second", **values, scans_per_second=hertz)
+    if not live_map.sealed_scans and len(live_map.close_loops()):
+        results.add("loops of the trajectory closed")

@@ -6,6 +6,7 @@ import threading
 import weakref
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +21,14 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.fitting.fit import fit, fit_rays
 from radarsdf.live.state import GrowingState
 from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
+from radarsdf.live.surface import NO_KEYS
 from radarsdf.live.tracking import Elsewhere, Follower
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Limits
+from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.locate import locate
+from radarsdf.poses.loops import visits
+from radarsdf.poses.refine import refine_poses
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex
 from radarsdf.returns.moving import moving_returns
 from radarsdf.returns.rays import check_scans
@@ -34,6 +39,7 @@ if TYPE_CHECKING:
     import trimesh
 
 _MOST_UNPLACED = 10 * SUBMAP_SCANS  # lost scans to search the map for
+_RANGED = 100  # scans from which the median range is known
 
 
 @dataclass(frozen=True)
@@ -200,8 +206,8 @@ class LiveMap:
         """Return the times (F,), s, NaN where unknown, and the poses (F, 4, 4) of the scans of :attr:`scan_ids`."""
         with self._owned(changes=False):
             known = self._state.log.trajectory()
-        times_s = np.array([time_s for *_, time_s in known], np.float64)  # NaN for None
-        return times_s, np.array([pose for _, pose, _ in known]).reshape(-1, 4, 4)
+        times_s = np.array([time_s for _, _, time_s, _ in known], np.float64)  # NaN for None
+        return times_s, np.array([pose for _, pose, *_ in known]).reshape(-1, 4, 4)
 
     def integrate(
         self,
@@ -219,7 +225,7 @@ class LiveMap:
         Without a pose, it is registered with the last scans, near the pose predicted by its Doppler or the motion so far. The
         world is then the frame of the first scan. If it agrees nowhere near, as the first scan after :meth:`load`, it is Lost,
         until every twelfth such scan is found by a search of the whole map, as in :func:`radarsdf.locate`; with it, those before
-        are added. :func:`radarsdf.refine_poses` corrects drift of the poses for :meth:`move_all`.
+        are added. :meth:`close_loops` corrects drift of the poses.
 
         Parameters
         ----------
@@ -292,7 +298,8 @@ class LiveMap:
         rows = np.flatnonzero((found.segments == found.segments[-1]) & (found.segments >= 0))
         if len(rows) == 0:
             raise lost
-        return [(scans[i], found.poses[i], self._unplaced[i][0]) for i in rows]
+        placed = [dataclasses.replace(scans[i], tracked=True) for i in rows]
+        return [(scan, found.poses[i], self._unplaced[i][0]) for i, scan in zip(rows, placed, strict=True)]
 
     def _integrate(
         self, scan: LoggedScan, given: Floats | None, scan_id: ScanId | None, far: int
@@ -353,8 +360,48 @@ class LiveMap:
                 pose = check_pose(given, f"the pose of scan {scan_id!r:.50}")
                 scan = self._state.log.get(scan_id)
                 if (pose != scan.pose).any():
-                    moved[scan_id] = dataclasses.replace(scan, pose=pose.copy())
+                    moved[scan_id] = dataclasses.replace(scan, pose=pose.copy(), tracked=False)
             return self._state.exchange(moved, moved)
+
+    def close_loops(self) -> Keys:
+        """Refine the poses of tracked scans where places are revisited, as :func:`radarsdf.refine_poses`, and move the scans to them.
+
+        Nothing changes if no place is revisited, or if held-out returns do not agree better. Given poses, and that of the first
+        scan, are kept. Scans may be integrated meanwhile: tracked ones move rigidly with the last refined scan. If others are moved or
+        removed meanwhile, nothing changes.
+
+        Raises
+        ------
+        ValueError, OSError
+            If scans were sealed, or cannot be read from the folder.
+        """
+        with self._owned():
+            self._check_unsealed()
+            log = self._state.log
+            timed = sorted((row for row in log.trajectory() if row[2] is not None), key=itemgetter(2))
+            if not any(tracked for *_, tracked in timed):
+                return NO_KEYS
+            ids, given, times_s, tracked = zip(*timed, strict=True)
+            some, poses = ids[:: 1 + len(ids) // _RANGED], np.stack(given)
+            range_m = median_range_m([log.get(scan_id).static.points for scan_id in some])
+            if not any(visits(range_m, poses)):
+                return NO_KEYS
+            drive = self._drive([*map(log.get, ids)], poses, times_s=np.array(times_s))
+        fixed = np.arange(len(ids)) == 0 if all(tracked) else ~np.array(tracked)
+        refined = refine_poses(drive, fixed=fixed, config=self.config, progress=False)
+        last = np.flatnonzero(~fixed)[-1]
+        T = refined.poses[last] @ np.linalg.inv(poses[last])
+        with self._owned():
+            now = self._state.log
+            if not refined.improved or now.edits != log.edits:
+                return NO_KEYS
+            moved = dict(zip(ids, refined.poses, strict=True))
+            come = {
+                scan_id: dataclasses.replace(now.get(scan_id), pose=moved.get(scan_id, T @ pose))
+                for scan_id, pose, _, is_tracked in now.trajectory()
+                if is_tracked
+            }
+            return self._state.exchange(come, come)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
         """Discard the map outside a ball. Scans that extend beyond it can no longer be moved or removed.
@@ -448,13 +495,16 @@ class LiveMap:
             If scans were sealed, or there are none.
         """
         with self._owned(changes=False):
-            sealed = f"{self.sealed_scans} scans were sealed by max_bytes or clear_outside"
-            check(not self.sealed_scans, f"{sealed}: give the map a folder to keep scans in")
+            self._check_unsealed()
             scans, origin = self._state.scans(), self._state.origin
         poses = np.stack([scan.pose for scan in scans])
         intensities = [scan.intensities for scan in scans if scan.intensities is not None]
         drive = self._drive(scans, poses, intensities=intensities or None)
         return fit(drive, config=self.config, progress=progress, origin=origin)
+
+    def _check_unsealed(self) -> None:
+        sealed = f"{self.sealed_scans} scans were sealed by max_bytes or clear_outside"
+        check(not self.sealed_scans, f"{sealed}: give the map a folder to keep scans in")
 
     def _drive(self, scans: list[LoggedScan], poses: Floats, **known: Any) -> Scans:
         speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]

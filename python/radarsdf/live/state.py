@@ -194,6 +194,7 @@ class GrowingState:
             ids=ids[: len(scans)],
             poses=[scan.pose.tolist() for scan in scans],
             times_s=[scan.time_s for scan in scans],
+            tracked=[scan_id for scan_id, scan in zip(ids, scans, strict=False) if scan.tracked],
             mountings=mountings,
             radars=[] if self.mountings is None else [[*self.mountings].index(scan.label) for scan in scans],
         )

@@ -66,6 +66,7 @@ class LoggedScan:
     is_static: Bools | None = None  # (N,) mask of the static returns, those in the map. None: all
     time_s: float | None = None
     radar: Mounted | None = None  # of several. `pose` is then T_world_body
+    tracked: bool = False  # whether its pose is an estimate relative to those of other scans
 
     @property
     def T_world_sensor(self) -> Floats:
@@ -110,7 +111,7 @@ class _Rows:
         # No process reads the file after this one: it need not survive a crash.
         opened.executescript(
             "PRAGMA journal_mode = MEMORY; PRAGMA synchronous = OFF;"
-            f"CREATE TABLE scans(number INTEGER PRIMARY KEY, place, id, pose, time_s, radar, {', '.join(_KINDS)});"
+            f"CREATE TABLE scans(number INTEGER PRIMARY KEY, place, id, pose, time_s, tracked, radar, {', '.join(_KINDS)});"
             "CREATE INDEX of_id ON scans(id); CREATE INDEX in_order ON scans(place, id)"
         )
         return opened
@@ -177,14 +178,17 @@ class ScanLog:
         """Identifiers of the scans that can be removed."""
         return [scan_id for scan_id, *_ in self.trajectory()]
 
-    def trajectory(self) -> list[tuple[ScanId, Floats, float | None]]:
-        """Return id, pose (4, 4) and time, s, of the scans that can be removed, in order, without reading their returns."""
-        columns = "number, id, pose, time_s FROM scans WHERE number < ? ORDER BY place"
+    def trajectory(self) -> list[tuple[ScanId, Floats, float | None, bool]]:
+        """Return id, pose (4, 4), time, s, and whether tracked, of the scans that can be removed, in order, without reading their returns."""
+        columns = "number, id, pose, time_s, tracked FROM scans WHERE number < ? ORDER BY place"
         stored = self._rows.read(columns, self._end) if self._stored else []
         stored = [row for row in stored if row[0] not in self._gone]
         return [
-            *((scan_id, _pose_of(pose), time_s) for _, scan_id, pose, time_s in stored),
-            *((scan_id, scan.pose, scan.time_s) for scan_id, scan in self._scans.items()),
+            *(
+                (scan_id, _pose_of(pose), time_s, bool(tracked))
+                for _, scan_id, pose, time_s, tracked in stored
+            ),
+            *((scan_id, scan.pose, scan.time_s, scan.tracked) for scan_id, scan in self._scans.items()),
         ]
 
     def placed(self, scan_id: ScanId) -> tuple[Floats, float | None] | None:
@@ -198,18 +202,18 @@ class ScanLog:
         """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
         sealed = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside"
         check(scan_id not in self.sealed, f"{sealed}; give the map a folder to keep scans in")
-        row = self._row(scan_id, "radar", *_KINDS)
+        row = self._row(scan_id, "tracked", "radar", *_KINDS)
         if row is None:
             check(scan_id in self._scans, f"the map has no scan {scan_id!r}", KeyError)
             return self._scans[scan_id]
-        _, _, pose, time_s, radar, *blobs = row
+        _, _, pose, time_s, tracked, radar, *blobs = row
         arrays = [
             None if blob is None else np.frombuffer(blob, chr(blob[0]), offset=1).copy() for blob in blobs
         ]
         held: dict[str, Any] = dict(zip(_KINDS, arrays, strict=True))
         held["points"] = held["points"].reshape(-1, 3)
         mounted = None if radar is None else self._radars[radar]
-        return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted)
+        return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted, tracked=bool(tracked))
 
     def scans(self, every: int = 1) -> Iterator[LoggedScan]:
         """Iterate over every n-th scan that can be removed, in order."""
@@ -249,7 +253,8 @@ class ScanLog:
             held = [scan.arrays.get(name) for name in _KINDS]
             blobs = [None if array is None else array.dtype.char.encode() + array.tobytes() for array in held]
             radar = None if scan.radar is None else labels.index(scan.label)
-            rows.append((number, place, scan_id, scan.pose.tobytes(), scan.time_s, radar, *blobs))
+            columns = place, scan_id, scan.pose.tobytes(), scan.time_s, scan.tracked, radar
+            rows.append((number, *columns, *blobs))
         self._rows.write(rows)
         self._end += len(rows)
         self._stored += len(rows)
@@ -357,6 +362,7 @@ class Described(BaseModel):
     # T_body_sensor, m, of the radars of a rig by label, and the number of that of each scan in `ids`.
     mountings: list[tuple[int | str, list[list[float]]]] | None = None
     radars: list[int] = []
+    tracked: list[int | str] = []  # those of `ids` whose poses are estimates
 
     @property
     def T_body_sensor(self) -> dict[Label, Floats] | None:
@@ -377,7 +383,7 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
     with reading(path, "the state of a live map of this version, or it is damaged", KeyError, TypeError):
         check_archive(path)
         described = Described.model_validate_json(arrays_of(path, ["described"])["described"].tobytes())
-        ids = [*described.ids, *described.sealed]
+        ids, tracked = [*described.ids, *described.sealed], set(described.tracked)
         check(len(set(ids)) == len(ids), "ids are duplicated")
         check(described.origin is not None or not ids, "the origin is missing")
         names = [f"{name} {i}" for i in range(len(described.ids)) for name in _KINDS]
@@ -385,7 +391,7 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
         scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
         numbers = described.radars if radars else [0] * len(described.ids)
         each = zip(described.ids, described.poses, described.times_s, numbers, strict=True)
-        for i, (_, pose, time_s, k) in enumerate(each):
+        for i, (scan_id, pose, time_s, k) in enumerate(each):
             held: dict[str, Any] = {name: arrays[key] for name in _KINDS if (key := f"{name} {i}") in arrays}
             points = positions(held["points"], "points")
             for name, array in held.items():
@@ -393,5 +399,6 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
                     check_values_of_scan(array, points, name, 0)
                 check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
             mounted = radars[k] if radars else None
-            scans.append(LoggedScan(check_pose(pose, "pose"), **held, time_s=time_s, radar=mounted))
+            known: dict[str, Any] = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}
+            scans.append(LoggedScan(check_pose(pose, "pose"), **held, **known))
         return described, scans, _sums_of(arrays)

@@ -130,6 +130,7 @@ class Follower:
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
         self._synchronise(track, log)
+        logged = dataclasses.replace(logged, tracked=len(self._steps) > 0)  # the first one defines the world
         new = Step(scan_id, logged, self._velocity(logged), Tracked(np.eye(4)), given=False)
         if not self._steps:
             if len(log):

@@ -31,7 +31,7 @@ _PASSES = 3  # of Gauss-Newton, coarse to fine
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
     """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted."""
-    revisited = visits(returns, poses)
+    revisited = visits(float(np.median(returns.ranges_m)), poses)
     returns = returns.every(-(-len(returns) // _MOST_RETURNS))
     points = returns.posed(poses).points.astype(np.float64)
     variances_m2 = noise.mean_variances_m2(returns.ranges_m)
@@ -105,9 +105,9 @@ def _path_m(poses: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(lengths_of_steps_m(poses))])
 
 
-def visits(returns: SensorReturns, poses: Floats) -> Iterator[tuple[Ints, Ints]]:
-    """Yield the scans of each later visit of a place, and those of earlier ones."""
-    path_m, range_m = _path_m(poses), float(np.median(returns.ranges_m))
+def visits(range_m: float, poses: Floats) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the scans of each later visit of a place, and those of earlier ones, given the median range."""
+    path_m = _path_m(poses)
     _, first, part = np.unique(np.floor(path_m / (_PART * range_m)), return_index=True, return_inverse=True)
     pairs = cKDTree(poses[first, :3, 3]).query_pairs(_SAME_PLACE * range_m, output_type="ndarray")
     pairs = pairs[path_m[first[pairs[:, 1]]] - path_m[first[pairs[:, 0]]] > _AWAY * range_m]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Floats
-from radarsdf.checks import hides_bar, usable_poses
+from radarsdf.arrays import Bools, Floats
+from radarsdf.checks import check, hides_bar, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.checked_scans import CheckedScans, checked_settings, join_radars
@@ -42,7 +42,7 @@ _EXACT = 1e-3  # tolerance for differences of solutions
 # Information of a weak prior on each pose, 1/m² and 1/rad²: unobserved components are not changed.
 WEAK = 1e-4
 _HELD_OUT = 0.2  # share of the returns for the test
-_FIXED = 1e10  # information that fixes the reference pose of the covariance
+_FIXED = 1e10  # information of a pose that is fixed, such as the reference of the covariance
 
 # Measurement of absolute poses (F, 4, 4): its Hessian (F, 6, 6) and gradient (F, 6) by increments.
 Anchor: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
@@ -116,19 +116,31 @@ class JointEstimator:
         return PosesEstimate(poses, covariance, motions, noise, rounds)
 
     def estimate_closed(
-        self, given: Floats, *, far: bool = False, progress: bool | None = False
+        self, given: Floats, *, far: bool = False, progress: bool | None = False, anchor: Anchor | None = None
     ) -> PosesEstimate:
         """:meth:`estimate`, and close the loops that are beyond the reach of its planes."""
-        found = self.estimate(given, far=far, progress=progress)
-        for visit in visits(self.returns, found.poses):
+        found = self.estimate(given, far=far, progress=progress, anchor=anchor)
+        for visit in visits(float(np.median(self.returns.ranges_m)), found.poses):
             planes = PlaneMap(self.cell_m, found.noise.variances)
             start = close_loop(self.returns, found.poses, visit, planes, self.config.num_threads)
             if start is None:
                 continue
-            closed = self.estimate(start)
+            closed = self.estimate(start, anchor=anchor)
             if Verdict.of(*_held_out(self.returns, 0), found.poses, closed.poses, closed.noise).closed:
-                found = replace(closed, poses=aligned(closed.poses, given))
+                found = replace(closed, poses=aligned(closed.poses, given)) if anchor is None else closed
         return found
+
+
+@dataclass(frozen=True)
+class _FixedPoses:
+    """Anchor at the `fixed` (F,) ones of poses (F, 4, 4)."""
+
+    poses: Floats
+    fixed: Bools
+
+    def __call__(self, poses: Floats) -> tuple[Floats, Floats]:
+        information = _FIXED * self.fixed[:, None]
+        return information[:, :, None] * np.eye(6), information * increments(self.poses, poses)
 
 
 def _held_out(returns: SensorReturns, seed: int) -> tuple[SensorReturns, SensorReturns]:
@@ -171,7 +183,7 @@ class RefinedPoses:
 
     poses: Floats
     """(F, 4, 4) T_world_sensor, of a rig T_world_body: the refined poses if they are an improvement, else the given ones. Mean position and mean
-    rotation are those of the given poses."""
+    rotation are those of the given poses, unless some are fixed."""
     covariance: Floats
     """(F, 6, 6) of `poses`, relative to the middle scan: translation, m, and rotation vector about the sensor, rad, in world
     axes. Conservative for loops of more than 32 scans."""
@@ -190,6 +202,7 @@ def refine_poses(
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
     times_s: ArrayLike | None = None,
+    fixed: ArrayLike | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> RefinedPoses:
@@ -207,6 +220,8 @@ def refine_poses(
         (F, 4, 4) T_world_sensor, m, one for each scan; of a rig, T_world_body.
     times_s : (F,) array_like, optional
         Times of the scans, s, needed with Doppler. Steps over gaps have larger errors. By default all steps are alike.
+    fixed : (F,) array_like of bool, optional
+        Poses to keep, relative to which the others are refined.
 
     Returns
     -------
@@ -218,7 +233,7 @@ def refine_poses(
     TypeError
         If an argument has the wrong type.
     ValueError
-        If poses are missing, shapes do not match, ranges cannot be in m, or times descend.
+        If poses are missing, shapes do not match, all poses are fixed, ranges cannot be in m, or times descend.
 
     Notes
     -----
@@ -238,6 +253,12 @@ def refine_poses(
     poses = filled(points, poses=poses)[2]
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
     given, rigid = usable_poses(poses, sum(len(checked.rows) for checked in radars))
+    anchor = None
+    if fixed is not None:
+        kept = np.asarray(fixed)
+        masks = kept.shape == (len(given),) and kept.dtype == bool and not kept.all()
+        check(masks, f"fixed must be one bool for each of {len(given)} poses, not all of them True")
+        anchor = _FixedPoses(given, kept)
     joined = join_radars(rig, [_compare_doppler(checked, given, rig) for checked in radars])
     scans, times, velocities, notes = joined.scans, joined.times_s, joined.velocities, joined.notes
     if not rigid.all():
@@ -255,9 +276,16 @@ def refine_poses(
         motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
     held, used = _held_out(returns, config.seed)
-    found = JointEstimator(used, motions, cell_m, config).estimate_closed(given, far=True, progress=progress)
+    estimator = JointEstimator(used, motions, cell_m, config)
+    found = estimator.estimate_closed(given, far=True, progress=progress, anchor=anchor)
+    if anchor is not None:  # to the bit
+        found.poses[anchor.fixed] = given[anchor.fixed]
     verdict = Verdict.of(held, used, given, found.poses, found.noise)
-    notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
+    still_open = open_loops(used, found.poses, found.noise)
+    if not still_open and any(visits(float(np.median(used.ranges_m)), found.poses)):
+        # Scans that close a loop come closer together: that of a lap of a car park, open by 1.4 m, was kept.
+        verdict = replace(verdict, crowding=0.0)
+    notes += still_open if verdict.improved else open_loops(used, given, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
     report |= {
         "verdict": verdict.words,
