@@ -30,7 +30,6 @@ _IN_COMMON = 0.003
 _OFFSET_ERRORS = 6.0  # standard errors of a significant offset: noise of directions is common to the scans
 _FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
-OFFSET = NOT_USED + ": {:.2f} m/s are added to that of all returns."
 
 
 class NoVelocityError(ValueError):
@@ -50,6 +49,7 @@ class SensorVelocities:
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
     of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
+    offset_mps: float = 0.0  # significant constant in the Doppler of static returns, as given, of either sign
 
     @classmethod
     def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> "SensorVelocities":
@@ -73,35 +73,8 @@ class SensorVelocities:
         mean[~found] = interpolate(times_s[~found], at, mean[found])
         away_s = np.abs(at - times_s[~found, None]).min(axis=1)
         covariance[~found] = np.multiply.outer(away_s, np.diag(change)) + covariance[found].mean(axis=0)
-        return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each)
-
-    def radial_offset_mps(self, scans: Sequence[Floats], doppler_mps: Sequence[Array]) -> float:
-        """Return a significant constant in the Doppler of all static returns, m/s, or 0.
-
-        Returns in different directions distinguish it from a velocity.
-        """
-        offsets, variances = [], []
-        if folding_interval_mps(doppler_mps) is not None:
-            return 0.0  # aliased speeds hide it
-        for scan, speeds, velocity in zip(scans, doppler_mps, self.of_scans, strict=True):
-            used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
-            if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
-                continue
-            away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
-            columns = np.column_stack([-away, np.ones(len(away))])
-            fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
-            if rank == 4:
-                inverse = np.linalg.inv(normal_matrix(columns, columns))
-                offsets.append(float(fitted[3]))
-                variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
-                variances.append(variance * float(inverse[3, 3]))
-        if len(offsets) < _FEWEST_OFFSETS:
-            return 0.0
-        weights = 1 / np.array(variances)
-        mean = float((weights * offsets).sum() / weights.sum())
-        squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
-        error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
-        return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
+        offset_mps = _offset_mps(each, scans, doppler_mps)
+        return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each, offset_mps=offset_mps)
 
     def select(self, rows: slice | Ints) -> Self:
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
@@ -133,6 +106,32 @@ class SensorVelocities:
     def step_covariances(self, durations_s: Floats) -> Floats:
         """Return the covariances (F - 1, 3, 3) of all steps, m²."""
         return np.stack([self.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
+
+
+def _offset_mps(each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequence[Array]) -> float:
+    """Return a significant constant in the Doppler of static returns, or 0. In all directions, it is no velocity."""
+    offsets, variances = [], []
+    if folding_interval_mps(doppler) is not None:
+        return 0.0  # aliased speeds hide it
+    for scan, speeds, velocity in zip(scans, doppler, each, strict=True):
+        used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
+        if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
+            continue
+        away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
+        columns = np.column_stack([-away, np.ones(len(away))])
+        fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
+        if rank == 4:
+            inverse = np.linalg.inv(normal_matrix(columns, columns))
+            offsets.append(float(fitted[3]))
+            variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
+            variances.append(variance * float(inverse[3, 3]))
+    if len(offsets) < _FEWEST_OFFSETS:
+        return 0.0
+    weights = 1 / np.array(variances)
+    mean = float((weights * offsets).sum() / weights.sum())
+    squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
+    error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
+    return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
