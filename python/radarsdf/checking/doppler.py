@@ -113,8 +113,8 @@ def _compare_block(recording: Scans, times_s: Floats, sign: float, wrong: str | 
     with contextlib.suppress(NoVelocityError):
         velocities = SensorVelocities.of(points, speeds, times_s[rows])
         tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
-        if tested.offset_mps:
-            evidence = f"{sign * tested.offset_mps:+.2f} m/s are added to the Doppler of all returns."
+        if tested.offset is not None:
+            evidence = f"{sign * tested.offset[0]:+.2f} m/s are added to the Doppler of all returns."
             yield Finding("doppler_offset", "warning", evidence)
         else:
             wrong = wrong or tested.contradiction

@@ -73,7 +73,7 @@ class CheckedScans:
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
         each = zip(scans, speeds, velocities.of_scans, strict=True)
-        known = not velocities.offset_mps  # with a constant, directions would be excluded
+        known = velocities.offset is None  # with one, directions would be excluded
         static = [x[one.static | np.isnan(mps)] if known and one.found else x for x, mps, one in each]
         moving = sum(map(len, scans)) - sum(map(len, static))
         return cls(rows, static, times_s, velocities, moving, notes)

@@ -11,13 +11,19 @@ from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import ERRORS, LEAST_M, Gain, of_neighbours
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.doppler import NOT_USED, DopplerMotion, SensorVelocities
+from radarsdf.poses.doppler import (
+    BY_CHANCE,
+    FEWEST_STEPS,
+    NOT_USED,
+    DopplerMotion,
+    Offset,
+    SensorVelocities,
+    windows_of,
+)
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import assembled, rotation, steps
 from radarsdf.poses.tracking import Drive, Tracker, track_once
 
-BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
-FEWEST_STEPS = 6  # of a window
 MOST_LATE = 10  # maximum delay of the Doppler that is tried, scans
 # Relative difference of speeds that axes and scale of a radar and given poses may have, ten times that of two motorway radars.
 _SAME_SPEED = 0.03
@@ -46,15 +52,6 @@ def runs_of(times_s: Floats) -> Ints:
     """Number (F,) the runs of scans without a gap."""
     durations_s = np.diff(times_s)
     return np.append(0, np.cumsum(durations_s > 2 * np.median(durations_s)))
-
-
-def windows_of(count: int) -> Iterator[slice]:
-    """Yield all steps, their halves, quarters and so on, of at least `FEWEST_STEPS`."""
-    parts = 1
-    while count // parts >= FEWEST_STEPS:
-        edges = np.linspace(0, count, parts + 1).astype(int).tolist()
-        yield from map(slice, edges, edges[1:])
-        parts *= 2
 
 
 def contradiction(
@@ -219,12 +216,12 @@ class Consistency:
     clock: Clock | None = None
     doubts: tuple[OtherMotion, ...] | None = None  # not excluded. None: too few scans with motion
     source: str = "the returns"
-    offset_mps: float = 0.0  # significant constant in the Doppler of all returns: nothing else is compared
+    offset: Offset | None = None  # in the Doppler of all returns: nothing else is compared
 
     @classmethod
     def of_radial(cls, velocities: SensorVelocities | None) -> "Consistency":
         """Compare the Doppler of returns in different directions only."""
-        return cls(doubts=(), offset_mps=0.0 if velocities is None else velocities.offset_mps)
+        return cls(doubts=(), offset=None if velocities is None else velocities.offset)
 
     @classmethod
     def of_poses(cls, velocities: SensorVelocities, times_s: Floats, poses: Floats) -> "Consistency":
@@ -321,8 +318,8 @@ class Consistency:
     @property
     def contradiction(self) -> str | None:
         """What contradicts the Doppler, in words."""
-        if self.offset_mps:
-            return f"{self.offset_mps:.2f} m/s are added to that of all returns"
+        if self.offset is not None:
+            return "{:.2f} m/s are added to that of all returns from scan {} to {}".format(*self.offset)
         if self.contradicted is not None:
             return self.contradicted.words(self.source)
         when = f"{abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"

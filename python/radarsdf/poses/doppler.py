@@ -1,10 +1,12 @@
 """Velocities of a sensor, or of the body of several, from Doppler, and the motion between scans that they imply."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
+from scipy.stats import t as student
 from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
@@ -29,6 +31,11 @@ _LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
 _IN_COMMON = 0.003
 _OFFSET_ERRORS = 6.0  # standard errors of a significant offset: noise of directions is common to the scans
 _FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
+BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
+FEWEST_STEPS = 6  # of a window
+Offset: TypeAlias = tuple[float, int, int]  # constant in the Doppler of all returns, m/s, from scan to scan
+# Objects that move slower may pass as static: of those near a hand-held radar, 13 scans in succession had an offset of 0.1 m/s.
+_PASSING_MPS = 0.15
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
 
 
@@ -49,7 +56,7 @@ class SensorVelocities:
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
     of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
-    offset_mps: float = 0.0  # significant constant in the Doppler of static returns, as given, of either sign
+    offset: Offset | None = None  # significant constant in the Doppler as given, of either sign
 
     @classmethod
     def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> "SensorVelocities":
@@ -73,8 +80,8 @@ class SensorVelocities:
         mean[~found] = interpolate(times_s[~found], at, mean[found])
         away_s = np.abs(at - times_s[~found, None]).min(axis=1)
         covariance[~found] = np.multiply.outer(away_s, np.diag(change)) + covariance[found].mean(axis=0)
-        offset_mps = _offset_mps(each, scans, doppler_mps)
-        return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each, offset_mps=offset_mps)
+        offset = _offset(each, scans, doppler_mps)
+        return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each, offset=offset)
 
     def select(self, rows: slice | Ints) -> Self:
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
@@ -108,12 +115,21 @@ class SensorVelocities:
         return np.stack([self.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
 
 
-def _offset_mps(each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequence[Array]) -> float:
-    """Return a significant constant in the Doppler of static returns, or 0. In all directions, it is no velocity."""
-    offsets, variances = [], []
+def windows_of(count: int) -> Iterator[slice]:
+    """Yield all steps, their halves, quarters and so on, of at least `FEWEST_STEPS`."""
+    parts = 1
+    while count // parts >= FEWEST_STEPS:
+        edges = np.linspace(0, count, parts + 1).astype(int).tolist()
+        yield from map(slice, edges, edges[1:])
+        parts *= 2
+
+
+def _offset(each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequence[Array]) -> Offset | None:
+    """Return a significant constant in the Doppler of static returns, which in all directions is no velocity."""
+    rows, offsets, variances = list[int](), list[float](), list[float]()
     if folding_interval_mps(doppler) is not None:
-        return 0.0  # aliased speeds hide it
-    for scan, speeds, velocity in zip(scans, doppler, each, strict=True):
+        return None  # aliased speeds hide it
+    for i, (scan, speeds, velocity) in enumerate(zip(scans, doppler, each, strict=True)):
         used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
         if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
             continue
@@ -122,16 +138,20 @@ def _offset_mps(each: list[SensorVelocity], scans: Sequence[Floats], doppler: Se
         fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
         if rank == 4:
             inverse = np.linalg.inv(normal_matrix(columns, columns))
+            rows.append(i)
             offsets.append(float(fitted[3]))
             variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
             variances.append(variance * float(inverse[3, 3]))
-    if len(offsets) < _FEWEST_OFFSETS:
-        return 0.0
-    weights = 1 / np.array(variances)
-    mean = float((weights * offsets).sum() / weights.sum())
-    squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
-    error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
-    return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
+    tried = [slice(len(rows)), *windows_of(len(rows))] if len(rows) >= _FEWEST_OFFSETS else []
+    for window, least_mps in zip(tried, [LEAST_MPS, *[_PASSING_MPS] * len(tried)], strict=False):
+        own, weights = np.array(offsets[window]), 1 / np.array(variances[window])
+        mean = float((weights * own).sum() / weights.sum())
+        squares = (weights**2 * (own - mean) ** 2).sum() / weights.sum() ** 2
+        error = float(np.sqrt(squares * len(own) / (len(own) - 1)))
+        errors = max(_OFFSET_ERRORS, student.ppf(1 - BY_CHANCE / (2 * len(tried)), len(own) - 1))
+        if abs(mean) > max(errors * error, least_mps):
+            return mean, rows[window][0], rows[window][-1]
+    return None
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
