@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 from scipy.stats import t as student
@@ -33,7 +32,6 @@ _OFFSET_ERRORS = 6.0  # standard errors of a significant offset: noise of direct
 _FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
 BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
 FEWEST_STEPS = 6  # of a window
-Offset: TypeAlias = tuple[float, int, int]  # constant in the Doppler of all returns, m/s, from scan to scan
 # Objects that move slower may pass as static: of those near a hand-held radar, 13 scans in succession had an offset of 0.1 m/s.
 _PASSING_MPS = 0.15
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
@@ -56,7 +54,8 @@ class SensorVelocities:
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
     of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
-    offset: Offset | None = None  # significant constant in the Doppler as given, of either sign
+    # Significant constant in the Doppler of all returns as given, m/s, from scan to scan.
+    offset: tuple[float, int, int] | None = None
 
     @classmethod
     def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> "SensorVelocities":
@@ -124,9 +123,21 @@ def windows_of(count: int) -> Iterator[slice]:
         parts *= 2
 
 
-def _offset(each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequence[Array]) -> Offset | None:
+def slope_of(x: Floats, y: Floats) -> tuple[float, float, Floats]:
+    """Regress y on x, (K,) or (K, 3), without intercept; return the slope, its standard error, and the residuals."""
+    # Errors of the components of a step depend on each other: cluster-robust, with as many degrees of freedom as steps less one.
+    count, square = len(x), max(float((x**2).sum()), 1e-12)
+    slope = float((x * y).sum()) / square
+    left = y - slope * x
+    scores = (x * left).reshape(count, -1).sum(axis=1)
+    return slope, float(np.sqrt((scores**2).sum() * count / (count - 1)) / square), left
+
+
+def _offset(
+    each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequence[Array]
+) -> tuple[float, int, int] | None:
     """Return a significant constant in the Doppler of static returns, which in all directions is no velocity."""
-    rows, offsets, variances = list[int](), list[float](), list[float]()
+    found = list[tuple[float, ...]]()
     if folding_interval_mps(doppler) is not None:
         return None  # aliased speeds hide it
     for i, (scan, speeds, velocity) in enumerate(zip(scans, doppler, each, strict=True)):
@@ -137,20 +148,16 @@ def _offset(each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequen
         columns = np.column_stack([-away, np.ones(len(away))])
         fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
         if rank == 4:
-            inverse = np.linalg.inv(normal_matrix(columns, columns))
-            rows.append(i)
-            offsets.append(float(fitted[3]))
             variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
-            variances.append(variance * float(inverse[3, 3]))
-    tried = [slice(len(rows)), *windows_of(len(rows))] if len(rows) >= _FEWEST_OFFSETS else []
+            inverse = np.linalg.inv(normal_matrix(columns, columns))
+            found.append((i, fitted[3], np.sqrt(variance * inverse[3, 3])))
+    tried = [slice(len(found)), *windows_of(len(found))] if len(found) >= _FEWEST_OFFSETS else []
     for window, least_mps in zip(tried, [LEAST_MPS, *[_PASSING_MPS] * len(tried)], strict=False):
-        own, weights = np.array(offsets[window]), 1 / np.array(variances[window])
-        mean = float((weights * own).sum() / weights.sum())
-        squares = (weights**2 * (own - mean) ** 2).sum() / weights.sum() ** 2
-        error = float(np.sqrt(squares * len(own) / (len(own) - 1)))
-        errors = max(_OFFSET_ERRORS, student.ppf(1 - BY_CHANCE / (2 * len(tried)), len(own) - 1))
+        rows, offsets, sigmas = np.array(found[window]).T
+        mean, error, _ = slope_of(1 / sigmas, offsets / sigmas)
+        errors = max(_OFFSET_ERRORS, student.ppf(1 - BY_CHANCE / (2 * len(tried)), len(rows) - 1))
         if abs(mean) > max(errors * error, least_mps):
-            return mean, rows[window][0], rows[window][-1]
+            return mean, int(rows[0]), int(rows[-1])
     return None
 
 
