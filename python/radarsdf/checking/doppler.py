@@ -112,12 +112,11 @@ def _compare_block(recording: Scans, times_s: Floats, sign: float, wrong: str | 
     speeds = [sign * np.asarray(values, np.float64) for values in (recording.doppler_mps or [])[rows]]
     with contextlib.suppress(NoVelocityError):
         velocities = SensorVelocities.of(points, speeds, times_s[rows])
-        tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
-        if tested.offset is not None:
-            evidence = f"{sign * tested.offset[0]:+.2f} m/s are added to the Doppler of all returns."
+        if velocities.offset is not None:
+            evidence = f"{sign * velocities.offset[0]:+.2f} m/s are added to the Doppler of all returns."
             yield Finding("doppler_offset", "warning", evidence)
-        else:
-            wrong = wrong or tested.contradiction
+        tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
+        wrong = wrong or tested.contradiction
         if tested.contradiction is None and tested.clock is not None and tested.clock.note:
             yield Finding("times_uneven", "warning", tested.clock.note[0])
     if wrong is not None:

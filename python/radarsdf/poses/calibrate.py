@@ -415,8 +415,8 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     imu = scans.imu if imu is None else imu
     if imu is not None and imu.R_sensor_imu is not None:
         imu = replace(imu, R_sensor_imu=mountings[reference, :3, :3].T @ imu.R_sensor_imu)
-    checked = CheckedScans.of_radars(scans, None, None, mounted=False)[1]
-    radars = [Consistency.of_radial(radar.velocities).corrected(radar.signed()) for radar in checked]
+    checked, undecided = CheckedScans.of_radars(scans, None, None, mounted=False)[1], Consistency(doubts=())
+    radars = [undecided.corrected(radar.signed()) for radar in checked]
     of_radars = {labels[rig.of_scan[radar.rows[0]]]: radar for radar in radars}
     notes = [f"{label}: {note}" for label, radar in of_radars.items() for note in radar.notes]
     static = {i: scan for radar in radars for i, scan in zip(radar.rows.tolist(), radar.scans, strict=True)}

@@ -206,18 +206,10 @@ class Consistency:
     clock: Clock | None = None
     doubts: tuple[OtherMotion, ...] | None = None  # not excluded. None: too few scans with motion
     source: str = "the returns"
-    offset: tuple[float, int, int] | None = None  # in the Doppler of all returns: nothing else is compared
-
-    @classmethod
-    def of_radial(cls, velocities: SensorVelocities | None) -> "Consistency":
-        """Compare the Doppler of returns in different directions only."""
-        return cls(doubts=(), offset=None if velocities is None else velocities.offset)
 
     @classmethod
     def of_poses(cls, velocities: SensorVelocities, times_s: Floats, poses: Floats) -> "Consistency":
         """Compare velocities and times (F,) with poses (F, 4, 4)."""
-        if (radial := cls.of_radial(velocities)).contradiction:
-            return radial
         shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
         clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
         times_s = times_s - clock.errors_s
@@ -233,9 +225,8 @@ class Consistency:
     def of_returns(cls, drive: Drive, config: FitConfig) -> "Consistency":
         """Compare scans, tracked with velocities that are hardly known; without enough of them, nothing is known."""
         durations_s, velocities = np.diff(drive.times_s), drive.velocities
-        radial = cls.of_radial(velocities)
-        if velocities is None or radial.contradiction or len(durations_s) < FEWEST_STEPS:
-            return replace(radial, doubts=None)
+        if velocities is None or len(durations_s) < FEWEST_STEPS:
+            return cls()
         lengths_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * durations_s
         most_apart = max(len(lengths_m) // (2 * FEWEST_STEPS), 1)
         every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, most_apart))
@@ -308,8 +299,6 @@ class Consistency:
     @property
     def contradiction(self) -> str | None:
         """What contradicts the Doppler, in words."""
-        if self.offset is not None:
-            return "{:.2f} m/s are added to that of all returns from scan {} to {}".format(*self.offset)
         if self.contradicted is not None:
             return self.contradicted.words(self.source)
         when = f"{abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
@@ -317,6 +306,10 @@ class Consistency:
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if they are contradicted; and notes."""
+        if velocities.offset is not None:
+            mps, first, last = velocities.offset
+            added = f"{mps:.2f} m/s are added to that of all returns from scan {first} to {last}"
+            return None, [f"{NOT_USED}: {added}."]
         if (why := self.contradiction) is not None:
             remedy = " Give each scan its own." if self.delay else ""
             if self.source == "the poses":
