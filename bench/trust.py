@@ -133,9 +133,9 @@ def _refine(told: Told) -> str:
     before, after, without = (
         float(np.sqrt((errors_m(p, told.scans.poses) ** 2).mean())) for p in (given, found.poses, plain.poses)
     )
-    marked = bool(found.report["notes"])
-    fine = after < max(1.5 * without, without + 0.01)
-    verdict = ("noted" if marked else "right") if fine else "marked" if marked else "WRONG"
+    marked, fine = bool(found.report["notes"]), after < max(1.5 * without, without + 0.01)
+    kept = not found.improved  # which its verdict and its covariance say
+    verdict = ("noted" if marked else "right") if fine else "marked" if marked or kept else "WRONG"
     return f"{verdict} {before:.2f}>{after:.2f} ({without:.2f}) m"
 
 

@@ -66,8 +66,9 @@ def test_wrong_speeds_are_excluded_and_named(street, motion, fault):
     assert len(refined.report["notes"]) == 1
 
 
-def test_an_offset_of_all_speeds_is_found(street, motion):
-    speeds = [values + np.float32(0.5) for values in motion.doppler_mps]
+@pytest.mark.parametrize("first", [0, 10])
+def test_an_offset_of_all_speeds_is_found(street, motion, first):
+    speeds = [values + np.float32(0.5 * (i >= first)) for i, values in enumerate(motion.doppler_mps)]
     assert not odometry(street, speeds, motion.times_s)[0].report["doppler"]
     assert "doppler_offset" in names(street, speeds, motion.times_s)
 

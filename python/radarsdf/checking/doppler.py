@@ -112,8 +112,8 @@ def _compare_block(recording: Scans, times_s: Floats, sign: float, wrong: str | 
     speeds = [sign * np.asarray(values, np.float64) for values in (recording.doppler_mps or [])[rows]]
     with contextlib.suppress(NoVelocityError):
         velocities = SensorVelocities.of(points, speeds, times_s[rows])
-        if offset_mps := velocities.radial_offset_mps(points, speeds):
-            evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
+        if velocities.offset is not None:
+            evidence = f"{sign * velocities.offset[0]:+.2f} m/s are added to the Doppler of all returns."
             yield Finding("doppler_offset", "warning", evidence)
         tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
         wrong = wrong or tested.contradiction

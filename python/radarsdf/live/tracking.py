@@ -18,7 +18,6 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import (
     LEAST_MPS,
     NOT_USED,
-    OFFSET,
     BodyVelocities,
     NoVelocityError,
     SensorVelocities,
@@ -217,9 +216,8 @@ class Follower:
         tested = Consistency.of_returns(drive, self.config)
         trusted, notes = tested.applied(velocities)
         begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
-        if offset_mps := velocities.radial_offset_mps(points, speeds):
-            trusted, notes = None, [OFFSET.format(offset_mps)]
-        elif trusted is None and (other := tested.contradicted) is not None and not other.confirmed:
+        other = tested.contradicted if velocities.offset is None else None
+        if other is not None and not other.confirmed:
             trusted, notes = velocities, [f"Assumed: the Doppler is right; {other.words('the returns')}."]
         if trusted is None:
             judged.time_s = -np.inf  # the next scans are judged, too

@@ -23,6 +23,7 @@ from radarsdf.arrays import Floats, Ints, Ints32
 from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.checked_scans import CheckedScans, checked_settings
+from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import LEAST_MPS, SensorVelocities
 from radarsdf.poses.imu import Inertial
 from radarsdf.poses.motion import Motion, unsteadiness
@@ -151,26 +152,28 @@ def _block_diagonal(blocks: Floats) -> Any:
     return sparse.bsr_matrix((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
 
 
-def _sensor_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Floats, Any, Any]:
-    """Poses (F, 4, 4) and velocities (F, 3) of the radars, and derivatives of their increments (6 F, U), and of these (3 F, U)."""
-    at = path.motion(radars.times_s - path.late_s[radars.of_scan])
-    M = path.mountings[radars.of_scan]
-    lever, arm = M[:, :3, 3], np.einsum("fij,fj->fi", at.R, M[:, :3, 3])
-    poses = assembled(at.R @ M[:, :3, :3], at.p + arm)
-    in_body = np.einsum("fji,fj->fi", at.R, at.v) + np.cross(at.omega, lever)
-    velocities = np.einsum("fji,fj->fi", M[:, :3, :3], in_body)
-    speeds = np.linalg.norm(velocities, axis=1)
-    by_motion, own = np.zeros((len(M), 9, 12)), np.zeros((len(M), 9, _OWN))
-    by_motion[:, :6, :6] = np.eye(6)
+def _pose_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Any]:
+    """Poses (F, 4, 4) of the radars, and derivatives (6 F, U) of their increments."""
+    at, M = path.motion(radars.times_s - path.late_s[radars.of_scan]), path.mountings[radars.of_scan]
+    arm = np.einsum("fij,fj->fi", at.R, M[:, :3, 3])
+    by_motion, own = np.tile(np.eye(6, 12), (len(M), 1, 1)), np.zeros((len(M), 6, _OWN))
     by_motion[:, :3, 3:6] = -skew(arm)
-    back, from_body = poses[:, :3, :3].swapaxes(1, 2), M[:, :3, :3].swapaxes(1, 2)
-    by_motion[:, 6:, 3:] = np.concatenate([back @ skew(at.v), back, -back @ skew(arm)], axis=2)
-    own[:, :3, :3] = own[:, 3:6, 3:6] = at.R
-    own[:, 6:, :3], own[:, 6:, 3:6] = from_body @ skew(at.omega), from_body @ skew(in_body)
-    own[:, 6:, 7:] = speeds[:, None, None] * np.eye(3)
-    of_poses = path.columns(at, by_motion[:, :6], own[:, :6], radars.of_scan)
-    of_velocities = path.columns(at, by_motion[:, 6:], own[:, 6:], radars.of_scan)
-    return poses, velocities + speeds[:, None] * path.shares[radars.of_scan], of_poses, of_velocities
+    own[:, :3, :3] = own[:, 3:, 3:6] = at.R
+    return assembled(at.R @ M[:, :3, :3], at.p + arm), path.columns(at, by_motion, own, radars.of_scan)
+
+
+def _velocity_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Any]:
+    """Velocities (F, 3) of the radars in their own frames, and derivatives (3 F, U)."""
+    at, M = path.motion(radars.times_s - path.late_s[radars.of_scan]), path.mountings[radars.of_scan]
+    arm = np.einsum("fij,fj->fi", at.R, M[:, :3, 3])
+    in_body = np.einsum("fji,fj->fi", at.R, at.v) + np.cross(at.omega, M[:, :3, 3])
+    velocities = np.einsum("fji,fj->fi", M[:, :3, :3], in_body)
+    speeds = np.linalg.norm(velocities, axis=1)[:, None]
+    back, from_body = (at.R @ M[:, :3, :3]).swapaxes(1, 2), M[:, :3, :3].swapaxes(1, 2)
+    by_motion = np.concatenate([0 * back, back @ skew(at.v), back, -back @ skew(arm)], axis=2)
+    by_mounting = from_body @ skew(at.omega), from_body @ skew(in_body), np.zeros((len(M), 3, 1))
+    own = np.concatenate([*by_mounting, speeds[:, None] * np.eye(3)], axis=2)
+    return velocities + speeds * path.shares[radars.of_scan], path.columns(at, by_motion, own, radars.of_scan)
 
 
 def _smooth_rows(path: BodyPath) -> tuple[Any, Floats]:
@@ -232,7 +235,7 @@ def _of_path_errors(path: BodyPath, radars: RadarsOfBody, whitening: Any, covari
 
     def expected(step: Floats) -> Floats:
         moved_path = path.moved(np.append(np.zeros(count), np.tile(step, K)))
-        J = (whitening @ _sensor_rows(moved_path, radars)[3]).tocsr()[:, :count]
+        J = (whitening @ _velocity_rows(moved_path, radars)[1]).tocsr()[:, :count]
         of_scans = _variances(J, covariance).reshape(-1, 3).sum(axis=1) / 2
         return np.bincount(radars.of_scan, of_scans, K).astype(np.float64)
 
@@ -258,7 +261,8 @@ def estimate_mountings(
         H, g = sparse.diags(held).tocsr(), np.zeros(len(held))
         off = [increments(given, path.mountings), path.late_s[:, None], path.shares]
         g[num_path:] = (information * np.concatenate(off, axis=1)).ravel()
-        poses, velocities, of_poses, of_velocities = _sensor_rows(path, radars)
+        poses, of_poses = _pose_rows(path, radars)
+        velocities, of_velocities = _velocity_rows(path, radars)
         off_mps = np.einsum("fij,fj->fi", radars.whitening, velocities - radars.mean_mps)
         robust = 1 / (1 + (off_mps**2).sum(axis=1) / (3 * _SIGMAS2))
         whitening = _block_diagonal(robust[:, None, None] * radars.whitening)
@@ -411,7 +415,8 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
     imu = scans.imu if imu is None else imu
     if imu is not None and imu.R_sensor_imu is not None:
         imu = replace(imu, R_sensor_imu=mountings[reference, :3, :3].T @ imu.R_sensor_imu)
-    radars = [radar.signed() for radar in CheckedScans.of_radars(scans, None, None, mounted=False)[1]]
+    checked, undecided = CheckedScans.of_radars(scans, None, None, mounted=False)[1], Consistency(doubts=())
+    radars = [undecided.corrected(radar.signed()) for radar in checked]
     of_radars = {labels[rig.of_scan[radar.rows[0]]]: radar for radar in radars}
     notes = [f"{label}: {note}" for label, radar in of_radars.items() for note in radar.notes]
     static = {i: scan for radar in radars for i, scan in zip(radar.rows.tolist(), radar.scans, strict=True)}

@@ -12,7 +12,7 @@ from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import MAX_TIME_S, check, instance, real_array, values_of_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import CLEAR, sign_significance, turns_fast
-from radarsdf.poses.doppler import NOT_USED, OFFSET, BodyVelocities, NoVelocityError, SensorVelocities
+from radarsdf.poses.doppler import NOT_USED, BodyVelocities, NoVelocityError, SensorVelocities
 from radarsdf.returns.moving import without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Rig
@@ -72,10 +72,9 @@ class CheckedScans:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
-        if offset_mps := velocities.radial_offset_mps(scans, speeds):
-            return replace(unused, notes=[*notes, OFFSET.format(offset_mps)])
         each = zip(scans, speeds, velocities.of_scans, strict=True)
-        static = [x[one.static | np.isnan(mps)] if one.found else x for x, mps, one in each]
+        known = velocities.offset is None  # with one, directions would be excluded
+        static = [x[one.static | np.isnan(mps)] if known and one.found else x for x, mps, one in each]
         moving = sum(map(len, scans)) - sum(map(len, static))
         return cls(rows, static, times_s, velocities, moving, notes)
 

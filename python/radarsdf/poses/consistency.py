@@ -11,13 +11,19 @@ from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import ERRORS, LEAST_M, Gain, of_neighbours
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.doppler import NOT_USED, DopplerMotion, SensorVelocities
+from radarsdf.poses.doppler import (
+    BY_CHANCE,
+    FEWEST_STEPS,
+    NOT_USED,
+    DopplerMotion,
+    SensorVelocities,
+    slope_of,
+    windows_of,
+)
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import assembled, rotation, steps
 from radarsdf.poses.tracking import Drive, Tracker, track_once
 
-BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
-FEWEST_STEPS = 6  # of a window
 MOST_LATE = 10  # maximum delay of the Doppler that is tried, scans
 # Relative difference of speeds that axes and scale of a radar and given poses may have, ten times that of two motorway radars.
 _SAME_SPEED = 0.03
@@ -48,15 +54,6 @@ def runs_of(times_s: Floats) -> Ints:
     return np.append(0, np.cumsum(durations_s > 2 * np.median(durations_s)))
 
 
-def windows_of(count: int) -> Iterator[slice]:
-    """Yield all steps, their halves, quarters and so on, of at least `FEWEST_STEPS`."""
-    parts = 1
-    while count // parts >= FEWEST_STEPS:
-        edges = np.linspace(0, count, parts + 1).astype(int).tolist()
-        yield from map(slice, edges, edges[1:])
-        parts *= 2
-
-
 def contradiction(
     shown_m: Floats, doppler_m: Floats, variances_m2: Floats, scans: Ints
 ) -> OtherMotion | None:
@@ -77,7 +74,7 @@ def contradiction(
             continue
         along = np.einsum("ki,ki->k", shown - doppler, longer) / np.maximum(lengths, 1e-9)
         root = np.sqrt(weights / np.maximum(lengths, 1e-9))
-        share, error, _ = _slope(root * lengths, root * along)
+        share, error, _ = slope_of(root * lengths, root * along)
         needed = student.ppf(1 - BY_CHANCE / (2 * len(tried)), len(shown) - 1) * error
         if abs(share) <= max(needed, ERRORS / np.sqrt(information)) + _SAME_SPEED:
             continue
@@ -117,7 +114,7 @@ class Clock:
         if used.sum() < FEWEST_STEPS or uneven_s.std() < _EVEN * np.median(durations_s):
             return cls(np.zeros(len(times_s)))
         missing_s = missing_s[used] - np.median(missing_s[used])
-        share, error, _ = _slope(uneven_s, missing_s)
+        share, error, _ = slope_of(uneven_s, missing_s)
         needed = student.ppf(1 - BY_CHANCE, used.sum() - 1) * error
         if share > needed:
             return cls(min(share, 1.0) * errors_s, float(min(needed, 1.0) * errors_s.std()))
@@ -169,26 +166,16 @@ def delay_of(
         # Without the part that a wrong scale explains.
         square = max((scaled**2).sum(), 1e-12)
         left, change, expected = (v - scaled * (v * scaled).sum() / square for v in others)
-        share, error, remaining = _slope(change, left)
+        share, error, remaining = slope_of(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
         # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
         if share > max(needed * error, 0.5) and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))
-        share, error, _ = _slope(expected, left)
+        share, error, _ = slope_of(expected, left)
         # Longer delays are compared in so few steps that most drives would not exclude them.
         if share + needed * error >= 1 and 3 * count > 2 * followed.sum():
             possible.append(delay)
     return min(found)[1], tuple(possible)
-
-
-def _slope(x: Floats, y: Floats) -> tuple[float, float, Floats]:
-    """Regress y on x, (K,) or (K, 3), without intercept; return the slope, its standard error, and the residuals."""
-    # Errors of the components of a step depend on each other: cluster-robust, with as many degrees of freedom as steps less one.
-    count, square = len(x), max(float((x**2).sum()), 1e-12)
-    slope = float((x * y).sum()) / square
-    left = y - slope * x
-    scores = (x * left).reshape(count, -1).sum(axis=1)
-    return slope, float(np.sqrt((scores**2).sum() * count / (count - 1)) / square), left
 
 
 _SAMPLED, _PAIRS = 100, 48  # returns of a scan, and maximum number of pairs of scans to compare
@@ -319,6 +306,10 @@ class Consistency:
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if they are contradicted; and notes."""
+        if velocities.offset is not None:
+            mps, first, last = velocities.offset
+            added = f"{mps:.2f} m/s are added to that of all returns from scan {first} to {last}"
+            return None, [f"{NOT_USED}: {added}."]
         if (why := self.contradiction) is not None:
             remedy = " Give each scan its own." if self.delay else ""
             if self.source == "the poses":

@@ -1,10 +1,11 @@
 """Velocities of a sensor, or of the body of several, from Doppler, and the motion between scans that they imply."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import t as student
 from typing_extensions import Self
 
 from radarsdf.arrays import Array, Bools, Floats, Ints
@@ -29,8 +30,11 @@ LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
 _IN_COMMON = 0.003
 _OFFSET_ERRORS = 6.0  # standard errors of a significant offset: noise of directions is common to the scans
 _FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
+BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
+FEWEST_STEPS = 6  # of a window
+# Objects that move slower may pass as static: of those near a hand-held radar, 13 scans in succession had an offset of 0.1 m/s.
+_PASSING_MPS = 0.15
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
-OFFSET = NOT_USED + ": {:.2f} m/s are added to that of all returns."
 
 
 class NoVelocityError(ValueError):
@@ -50,6 +54,8 @@ class SensorVelocities:
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
     of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
+    # Significant constant in the Doppler of all returns as given, m/s, from scan to scan.
+    offset: tuple[float, int, int] | None = None
 
     @classmethod
     def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> "SensorVelocities":
@@ -73,35 +79,8 @@ class SensorVelocities:
         mean[~found] = interpolate(times_s[~found], at, mean[found])
         away_s = np.abs(at - times_s[~found, None]).min(axis=1)
         covariance[~found] = np.multiply.outer(away_s, np.diag(change)) + covariance[found].mean(axis=0)
-        return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each)
-
-    def radial_offset_mps(self, scans: Sequence[Floats], doppler_mps: Sequence[Array]) -> float:
-        """Return a significant constant in the Doppler of all static returns, m/s, or 0.
-
-        Returns in different directions distinguish it from a velocity.
-        """
-        offsets, variances = [], []
-        if folding_interval_mps(doppler_mps) is not None:
-            return 0.0  # aliased speeds hide it
-        for scan, speeds, velocity in zip(scans, doppler_mps, self.of_scans, strict=True):
-            used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
-            if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
-                continue
-            away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
-            columns = np.column_stack([-away, np.ones(len(away))])
-            fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
-            if rank == 4:
-                inverse = np.linalg.inv(normal_matrix(columns, columns))
-                offsets.append(float(fitted[3]))
-                variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
-                variances.append(variance * float(inverse[3, 3]))
-        if len(offsets) < _FEWEST_OFFSETS:
-            return 0.0
-        weights = 1 / np.array(variances)
-        mean = float((weights * offsets).sum() / weights.sum())
-        squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
-        error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
-        return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
+        offset = _offset(each, scans, doppler_mps)
+        return cls(mean, covariance, change, found, climb_assumed=weak, of_scans=each, offset=offset)
 
     def select(self, rows: slice | Ints) -> Self:
         columns = {name: getattr(self, name)[rows] for name in ("mean_mps", "covariance", "found")}
@@ -133,6 +112,53 @@ class SensorVelocities:
     def step_covariances(self, durations_s: Floats) -> Floats:
         """Return the covariances (F - 1, 3, 3) of all steps, m²."""
         return np.stack([self.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
+
+
+def windows_of(count: int) -> Iterator[slice]:
+    """Yield all steps, their halves, quarters and so on, of at least `FEWEST_STEPS`."""
+    parts = 1
+    while count // parts >= FEWEST_STEPS:
+        edges = np.linspace(0, count, parts + 1).astype(int).tolist()
+        yield from map(slice, edges, edges[1:])
+        parts *= 2
+
+
+def slope_of(x: Floats, y: Floats) -> tuple[float, float, Floats]:
+    """Regress y on x, (K,) or (K, 3), without intercept; return the slope, its standard error, and the residuals."""
+    # Errors of the components of a step depend on each other: cluster-robust, with as many degrees of freedom as steps less one.
+    count, square = len(x), max(float((x**2).sum()), 1e-12)
+    slope = float((x * y).sum()) / square
+    left = y - slope * x
+    scores = (x * left).reshape(count, -1).sum(axis=1)
+    return slope, float(np.sqrt((scores**2).sum() * count / (count - 1)) / square), left
+
+
+def _offset(
+    each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequence[Array]
+) -> tuple[float, int, int] | None:
+    """Return a significant constant in the Doppler of static returns, which in all directions is no velocity."""
+    found = list[tuple[float, ...]]()
+    if folding_interval_mps(doppler) is not None:
+        return None  # aliased speeds hide it
+    for i, (scan, speeds, velocity) in enumerate(zip(scans, doppler, each, strict=True)):
+        used = velocity.static & np.isfinite(speeds) & scan.any(axis=1)
+        if used.sum() <= 2 * MIN_DOPPLER_RETURNS:
+            continue
+        away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
+        columns = np.column_stack([-away, np.ones(len(away))])
+        fitted, squares, rank, _ = np.linalg.lstsq(columns, speeds[used], rcond=1e-3)
+        if rank == 4:
+            variance = max(squares[0] / (used.sum() - 4), _LEAST_OFFSET_MPS**2)
+            inverse = np.linalg.inv(normal_matrix(columns, columns))
+            found.append((i, fitted[3], np.sqrt(variance * inverse[3, 3])))
+    tried = [slice(len(found)), *windows_of(len(found))] if len(found) >= _FEWEST_OFFSETS else []
+    for window, least_mps in zip(tried, [LEAST_MPS, *[_PASSING_MPS] * len(tried)], strict=False):
+        rows, offsets, sigmas = np.array(found[window]).T
+        mean, error, _ = slope_of(1 / sigmas, offsets / sigmas)
+        errors = max(_OFFSET_ERRORS, student.ppf(1 - BY_CHANCE / (2 * len(tried)), len(rows) - 1))
+        if abs(mean) > max(errors * error, least_mps):
+            return mean, int(rows[0]), int(rows[-1])
+    return None
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:

@@ -18,7 +18,7 @@ _LEAST_SPAN = 0.1  # minimum duration of a step, median steps: two scans at the 
 LEAST_S = 1e-6  # of a step, against division by zero
 _YAW = 5  # component of a step
 _NO_LEVER = np.zeros((3, 3))
-_LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # minimum deviations, below the resolution of any radar
+_LEAST = np.square([1e-5, 1e-6])  # minimum variances, m² and rad², below the resolution of any radar
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def step_variances(poses: Floats, diagonal: Floats, below: Floats) -> Floats:
     first, second = _jacobians(poses)
     blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
     variances = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
-    return np.maximum(variances, _LEAST_RAD**2)  # of a weak prior, blocks cancel
+    return np.maximum(variances, _LEAST[1])  # of a weak prior, blocks cancel
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Motion:
         """Build from poses (F, 4, 4) at `times_s` (F,). Step errors accumulate: variances grow with time."""
         spans = spans_of(times_s)
         shares = np.repeat(spans[:, None], 6, axis=1)
-        variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
+        variances = np.maximum(np.square([sigma_m, sigma_rad]), _LEAST)
         return cls(steps(poses), shares, spans, variances=variances)
 
     def evidence(self) -> "Motion":
@@ -243,7 +243,7 @@ class Motion:
         bias[:_YAW] *= (gained / np.maximum(gained + left_mean * variances, 1e-30))[:_YAW]
         squares = ((errors - bias * spans) ** 2 + left) * weights
         sums, counts = squares.sum(axis=0).reshape(2, 3).sum(axis=1), counts.reshape(2, 3).sum(axis=1)
-        found = np.maximum(sums / np.maximum(counts, 1), [_LEAST_M**2, _LEAST_RAD**2])
+        found = np.maximum(sums / np.maximum(counts, 1), _LEAST)
         return replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
 
 
@@ -283,7 +283,7 @@ class SteadyMotion(Motion):
         # Damped by half at twice the information: the same gradient, but steps that move together do not overshoot.
         moves, turns = (0.5 * durations_s * (r + m)[measured] for r, (m, _) in zip(rates, both, strict=True))
         variances = np.concatenate([v for _, v in both], axis=1)[measured] * 0.5 * durations_s**2
-        variances = np.maximum(variances, np.repeat([_LEAST_M**2, _LEAST_RAD**2], 3))
+        variances = np.maximum(variances, np.repeat(_LEAST, 3))
         shares = np.where(np.isinf(self.shares), np.inf, variances)
         return replace(self, steps=transform(turns, moves), shares=shares)
 

@@ -225,8 +225,11 @@ class Drive:
     def motions(self, poses: Floats, turns: Floats, rows: slice) -> list[Motion]:
         """Return the measured motions between the K scans of `rows`, with tracked poses (K, 4, 4) and turns (K - 1, 3)."""
         times_s = self.times_s[rows]
-        duration_s, turn_sigma_rad_s = usual_duration_s(np.diff(times_s)), np.full(3, self.usual_turn_rad_s)
-        usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
+        durations_s = np.diff(times_s)
+        # A vehicle that turns on the spot, or laps fast, turns more than its speed lets expect.
+        shown = np.square(turns).sum(axis=0).max() / max(np.square(durations_s).sum(), 1e-9)
+        usual = np.array([self.moves.usual.max(), max(self.usual_turn_rad_s**2, shown)])
+        duration_s, turn_sigma_rad_s = usual_duration_s(durations_s), np.full(3, self.usual_turn_rad_s)
         gyroscope = self.inertial.gyroscope
         measured = np.repeat([self.velocities is not None, gyroscope is not None], 3)
         motions: list[Motion] = [SteadyMotion.by(self.steady, usual, times_s, poses, measured)]

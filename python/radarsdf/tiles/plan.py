@@ -245,5 +245,5 @@ def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
     path = map_path(folder, tile)
     wrong = SafetensorError, KeyError, TypeError, RecursionError
     with reading(path, "a complete radarsdf map", *wrong), open_tensors(path, "np") as file:
-        _ = file.checksums  # of the metadata, too
+        _ = file.checksums  # raises a ValueError if that of the metadata is wrong
         return checked_report(json.loads(file.metadata["description"])["report"])
