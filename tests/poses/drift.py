@@ -27,6 +27,17 @@ def velocities_of(mean_mps, covariance):
     return SensorVelocities(mean_mps, every, np.ones(3), np.ones(count, bool))
 
 
+def normalised_errors(found, true):
+    """Squared errors (F - 1,) of positions relative to the middle scan, per axis, with the covariance as the unit."""
+    middle = len(true) // 2
+    T = true[middle] @ np.linalg.inv(found.poses[middle])
+    errors_m = (T @ found.poses - true)[:, :3, 3]
+    covariance = T[:3, :3] @ found.covariance[:, :3, :3] @ T[:3, :3].T
+    others = np.arange(len(true)) != middle
+    solved = np.linalg.solve(covariance[others], errors_m[others, :, None])[:, :, 0]
+    return (errors_m[others] * solved).sum(axis=1) / 3
+
+
 def position_error_m(poses, true):
     """Root mean square, m."""
     return float(np.sqrt(((poses - true)[:, :3, 3] ** 2).sum(axis=1).mean()))

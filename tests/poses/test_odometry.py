@@ -11,7 +11,7 @@ from radarsdf.simulate import drifted, measured_motion
 from scenes.kinds import KINDS
 
 from ..conftest import recorded_file
-from .drift import first, position_error_m, thinned
+from .drift import first, normalised_errors, position_error_m, thinned
 
 BIAS_RAD_S = (0.01, -0.02, 0.03)
 
@@ -56,11 +56,7 @@ def test_returns_alone_are_not_counted_twice():
     """Steps tracked by the same returns are not independent evidence: NEES / 3 was 8 and more."""
     street = first(radarsdf.simulate.oculii, 20, seed=6, frames=30)
     found = radarsdf.odometry(street.points, times_s=measured_motion(street).times_s)
-    T = street.poses[10] @ np.linalg.inv(found.poses[10])
-    off = (np.einsum("ij,fjk->fik", T, found.poses) - street.poses)[:, :3, 3]
-    covariance = np.einsum("ij,fjk,lk->fil", T[:3, :3], found.covariance[:, :3, :3], T[:3, :3])
-    nees = [e @ np.linalg.solve(C, e) / 3 for e, C in zip(off, covariance, strict=True) if e.any()]
-    assert 0.1 < np.median(nees) < 3
+    assert 0.1 < np.median(normalised_errors(found, street.poses)) < 3
 
 
 def test_errors_of_tracked_steps_do_not_persist():
@@ -114,14 +110,7 @@ def test_poses_are_estimated_from_doppler_and_returns(drive, found):
 
 
 def test_errors_agree_with_the_covariance(drive, found):
-    middle = len(drive.poses) // 2
-    whole = drive.poses[middle] @ np.linalg.inv(found.poses[middle])
-    off = (whole @ found.poses)[:, :3, 3] - drive.poses[:, :3, 3]
-    turned = np.einsum("ij,fjk,lk->fil", whole[:3, :3], found.covariance[:, :3, :3], whole[:3, :3])
-    normalised = [
-        e @ np.linalg.solve(c, e) / 3 for i, (e, c) in enumerate(zip(off, turned, strict=True)) if i != middle
-    ]
-    assert 0.2 < np.mean(normalised) < 5
+    assert 0.2 < np.mean(normalised_errors(found, drive.poses)) < 5
 
 
 def test_a_gyroscope_measures_rotations_and_its_bias_is_estimated(drive, motion, found):
