@@ -90,15 +90,11 @@ def test_enclosed_kinds_have_a_roof(scenes):
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
-def flat_ground():
-    return Terrain(np.ones((1, 2)), np.zeros(1), np.zeros(1), 0.0, materials.GRASS)
-
-
 def wall_world():
     """A wall with the front x = 0 and the back x = -0.3, on ground at z = 0 and extending below it."""
     wall = Box(np.array([-0.15, 0.0, 1.0]), np.array([0.15, 5.0, 2.0]), 0.0, materials.BRICK)
     pole = Pole(np.array([4.0, 0.0, 0.0]), 0.1, 3.0, materials.METAL)
-    return World([wall, pole], flat_ground())
+    return World([wall, pole], Terrain(np.ones((1, 2)), np.zeros(1), np.zeros(1), 0.0, materials.GRASS))
 
 
 def errors(points, normal):

@@ -160,12 +160,6 @@ def memory_of(weights):
     return np.zeros(_core.soap_memory_size(*weights.shape), weights.dtype)
 
 
-def dependent_gradients(rng, rows, columns):
-    """Gradients with correlated columns, as of a layer with correlated inputs."""
-    mix = rng.normal(size=(columns, columns)) * np.geomspace(0.1, 1, columns)
-    return rng.normal(size=(rows, columns)) @ mix
-
-
 @functools.cache
 def way_of_the_formula(rows, columns):
     """Initial weights, and gradient and weights of each step; for all instruction sets."""
@@ -173,7 +167,8 @@ def way_of_the_formula(rows, columns):
     weights, reference, steps = rng.normal(size=(rows, columns)), Reference(rows, columns), []
     expected = weights
     for _ in range(1, 40):
-        gradient = dependent_gradients(rng, rows, columns)
+        mix = rng.normal(size=(columns, columns)) * np.geomspace(0.1, 1, columns)
+        gradient = rng.normal(size=(rows, columns)) @ mix  # correlated columns, as of correlated inputs
         expected = reference.move(expected, gradient, RATE)
         steps.append((gradient, expected))
     return weights, steps

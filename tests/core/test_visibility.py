@@ -12,14 +12,6 @@ THREADS = (1, 2, 3, 7)
 MANY = 10_000  # enough for several threads
 
 
-def sorted_cells(cells):
-    """Distinct cells (C, 3) in the order of their keys, and the keys."""
-    cells = np.unique(cells, axis=0)
-    keys = cell_keys((cells + 0.5) * LEAF_M, LEAF_M)
-    order = np.argsort(keys)
-    return cells[order], keys[order]
-
-
 def rays_of(kind, count, seed=0):
     """Points, directions, ranges, float32."""
     rng = np.random.default_rng(seed)
@@ -41,13 +33,16 @@ def rays_of(kind, count, seed=0):
 
 
 def cells_near(points, seed=0):
-    """A few leaf cells in about every fourth cube with points, and some far from them."""
+    """Leaf cells (C, 3), a few in about every fourth cube with points, some far from them, in the order of their keys; and the keys."""
     rng = np.random.default_rng(seed)
     middle = np.round(np.median(points, axis=0) / LEAF_M).astype(int)
     near = middle + rng.integers(-80, 80, (1500, 3))
     beside = near[:500] + rng.integers(0, 2, (500, 3))
     far = middle + rng.integers(2000, 4000, (50, 3))
-    return sorted_cells(np.concatenate([near, beside, far]))
+    cells = np.unique(np.concatenate([near, beside, far]), axis=0)
+    keys = cell_keys((cells + 0.5) * LEAF_M, LEAF_M)
+    order = np.argsort(keys)
+    return cells[order], keys[order]
 
 
 def scans_of(count, seed=0):

@@ -28,16 +28,10 @@ def test_same_bits_as_pytorch_s():
     assert not torch.equal(ours[0], start[0])
 
 
-def network_and_gradients(seed):
-    """Parameters of a network, and gradients for fifty steps."""
-    generator = torch.Generator().manual_seed(seed)
-    shapes = ((6, 9), (6,), (5, 6), (5,), (1, 5), (1,))
-    network = [torch.randn(shape, generator=generator).requires_grad_() for shape in shapes]
-    return network, [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(50)]
-
-
 def test_soap_resumes_from_its_state_and_threads_change_no_bit():
-    whole, gradients = network_and_gradients(1)
+    generator, shapes = torch.Generator().manual_seed(1), ((6, 9), (6,), (5, 6), (5,), (1, 5), (1,))
+    whole = [torch.randn(shape, generator=generator).requires_grad_() for shape in shapes]
+    gradients = [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(50)]
     resumed = [p.detach().clone().requires_grad_() for p in whole]
     soap, first, second = Soap(whole, 1e-2), Soap(resumed, 1e-2), Soap(resumed, 1e-2)
     with ThreadPool(3) as pool:

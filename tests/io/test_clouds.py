@@ -216,15 +216,8 @@ def lazily(origin, optional=True):
 
 def expected(origin):
     scans = [one_scan(number, origin) for number in range(len(COUNTS))]
-    columns = dict(
-        zip(
-            "xyz",
-            np.concatenate(
-                [s.points @ s.T_world_sensor[:3, :3].T + s.T_world_sensor[:3, 3] for s in scans]
-            ).T,
-            strict=True,
-        )
-    )
+    world = np.concatenate([s.points @ s.T_world_sensor[:3, :3].T + s.T_world_sensor[:3, 3] for s in scans])
+    columns = dict(zip("xyz", world.T, strict=True))
     columns["intensity"] = np.concatenate([s.intensities for s in scans])
     columns["doppler"] = np.concatenate([s.doppler_mps for s in scans])
     columns["scan"] = np.repeat(np.arange(len(COUNTS)), COUNTS)

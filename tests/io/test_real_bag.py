@@ -10,13 +10,9 @@ from ..conftest import recorded_file
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
 
-def bag_and_poses():
-    return recorded_file("ti_iwr6843/ti_mmwave_rospkg_demo.bag"), recorded_file("ti_iwr6843/poses.tum")
-
-
 def test_it_becomes_the_scans_that_it_holds():
-    bag, poses = bag_and_poses()
-    scans = read(bag, poses)
+    bag = recorded_file("ti_iwr6843/ti_mmwave_rospkg_demo.bag")
+    scans = read(bag, recorded_file("ti_iwr6843/poses.tum"))
     with np.load(recorded_file("ti_iwr6843/ti_scene.npz")) as expected:
         assert_array_equal(np.concatenate(scans.points), expected["points"])
         assert_array_equal(np.concatenate(scans.intensities), expected["intensity"])

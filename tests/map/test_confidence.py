@@ -155,31 +155,14 @@ CONFIG = FitConfig.quick().override(
 )
 
 
-def floor_m(radar_map):
-    """Error that repetition does not reduce, m."""
-    return confidences.floor_cells(radar_map._contents) * LEAF_M
-
-
-def two_walls(scans=4, returns=400):
-    """A wall at x = 5 and one at x = 40, each 4 m wide and 2 m high, seen from the origin."""
-    rng = np.random.default_rng(0)
-    points = [
-        np.column_stack(
-            [
-                np.repeat([5.0, 40.0], returns),
-                np.concatenate([rng.uniform(-4, -0.5, returns), rng.uniform(0.5, 4, returns)]),
-                rng.uniform(-1, 1, 2 * returns),
-            ]
-        )
-        for _ in range(scans)
-    ]
-    return points, np.tile(np.eye(4), (scans, 1, 1))
-
-
 @pytest.fixture(scope="module")
 def walls():
-    points, poses = two_walls()
-    return points, radarsdf.fit(points, poses, config=CONFIG, progress=False)
+    """A wall at x = 5 and one at x = 40, each 4 m wide and 2 m high, seen from the origin by four scans."""
+    rng, points = np.random.default_rng(0), []
+    for _ in range(4):
+        y = np.concatenate([rng.uniform(-4, -0.5, 400), rng.uniform(0.5, 4, 400)])
+        points.append(np.column_stack([np.repeat([5.0, 40.0], 400), y, rng.uniform(-1, 1, 800)]))
+    return points, radarsdf.fit(points, np.tile(np.eye(4), (4, 1, 1)), config=CONFIG, progress=False)
 
 
 def test_uncertainty_is_the_standard_error_of_returns_near_a_cell(walls):
@@ -189,8 +172,9 @@ def test_uncertainty_is_the_standard_error_of_returns_near_a_cell(walls):
     cells = np.floor(local / LEAF_M)
     centres = np.unique(cells, axis=0)[::29]
     variances = KNOWN.variances_m2(np.linalg.norm(returns, axis=1).astype(np.float32))
+    floor_m = confidences.floor_cells(radar_map._contents) * LEAF_M  # repetition does not reduce it
     expected = [
-        np.hypot(np.sum(1 / variances[(np.abs(cells - centre) <= 1).all(axis=1)]) ** -0.5, floor_m(radar_map))
+        np.hypot(np.sum(1 / variances[(np.abs(cells - centre) <= 1).all(axis=1)]) ** -0.5, floor_m)
         for centre in centres
     ]
     found = radar_map.uncertainty((centres + 0.5) * LEAF_M + radar_map.origin)

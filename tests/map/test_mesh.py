@@ -74,13 +74,12 @@ def test_any_voxel_size_gives_the_same_surface(sharp_map, mesh_of, voxel_size):
     # x from 9 to 19 and y from -5 to 5: nothing is missing, and little is duplicated.
     assert 95 < projected < 125
     # At most a voxel outside the observed space.
-    nearest = np.clip(mesh.vertices, *sharp_map_bounds(sharp_map))
+    cells = sharp_map.field.table.leaf_cells()
+    lower, upper = (
+        corner * LEAF_M + sharp_map.origin for corner in (cells.min(axis=0), cells.max(axis=0) + 1)
+    )
+    nearest = np.clip(mesh.vertices, lower, upper)
     assert np.abs(mesh.vertices - nearest).max() <= voxel_size + 1e-6
-
-
-def sharp_map_bounds(radar_map):
-    cells = radar_map.field.table.leaf_cells()
-    return cells.min(axis=0) * LEAF_M + radar_map.origin, (cells.max(axis=0) + 1) * LEAF_M + radar_map.origin
 
 
 @pytest.mark.parametrize("voxel_size", [0.1, 0.15, 0.3])

@@ -12,6 +12,7 @@ from radarsdf.returns.evidence import _MAX_SUPPORT, Evidence, ReturnsOfCells, br
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sums import ReturnCells, lattice_of
 
+from ..conftest import pose
 from ..reference_visibility import looks_at
 
 LEAF_M = 0.2
@@ -168,36 +169,16 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
     assert at(evidence, leaf_keys, SIDE)[1:] == (1, 2)
 
 
-def rays_to(cells, count=1):
-    """`count` returns in the middle of each cell, from a distant sensor."""
-    points = (np.repeat(np.asarray(cells, float), count, axis=0) + 0.5) * LEAF_M
-    pose = np.eye(4)
-    pose[:3, 3] = [0, 0, 30]
-    # The origin of the local frame is the sensor, a whole number of cells away.
-    return prepare([points - pose[:3, 3]], pose[None], min_range_m=1.0, max_range_m=None)
-
-
-def leaf_keys_of(rays):
-    cells = CellSet(LEAF_M)
-    cells.insert(np.ascontiguousarray(rays.points), 1)
-    return cells.sorted_keys(1)
-
-
-def added(rays, max_cells, leaf_keys=None):
-    leaf_keys = leaf_keys_of(rays) if leaf_keys is None else leaf_keys
-    cells = ReturnCells.of(rays, LEAF_M)
-    result = bridged(leaf_keys, cells.keys, cells.counts, max_cells)
-    np.testing.assert_array_equal(result, bridged(leaf_keys, cells.keys, cells.counts, max_cells, 3))
-    assert (np.diff(result.astype(np.int64)) > 0).all()
-    assert np.isin(leaf_keys, result).all()
-    return set(np.setdiff1d(result, leaf_keys).tolist())
-
-
 @pytest.mark.parametrize("max_cells", [1, 2, 4, 9])
 def test_bridges_equal_a_search_of_all_pairs(max_cells):
     rng = np.random.default_rng(max_cells)
-    rays = rays_to(rng.integers(-6, 6, (150, 3)))
-    leaf_keys = leaf_keys_of(rays)
+    points = (rng.integers(-6, 6, (150, 3)) + 0.5) * LEAF_M
+    # The origin of the local frame is the sensor, a whole number of cells away.
+    sensor = np.array([0, 0, 30.0])
+    rays = prepare([points - sensor], pose(sensor)[None], min_range_m=1.0, max_range_m=None)
+    occupied = CellSet(LEAF_M)
+    occupied.insert(np.ascontiguousarray(rays.points), 1)
+    leaf_keys = occupied.sorted_keys(1)
     cells = np.unique(np.floor(rays.points / np.float32(LEAF_M)).astype(int), axis=0)
     keys = cell_keys(((cells + 0.5) * LEAF_M), LEAF_M)
     support = within_a_cell(rays.points, keys).sum(axis=1)
@@ -214,4 +195,7 @@ def test_bridges_equal_a_search_of_all_pairs(max_cells):
             if (support[[i, j]] >= least[[i, j]]).all() and support[i] + support[j] < 2 * _MAX_SUPPORT:
                 line = a + np.arange(1, distance)[:, None] * (way // distance)
                 expected |= set(cell_keys((line + 0.5) * LEAF_M, LEAF_M).tolist())
-    assert added(rays, max_cells) == expected - set(leaf_keys.tolist())
+    returns = ReturnCells.of(rays, LEAF_M)
+    found = bridged(leaf_keys, returns.keys, returns.counts, max_cells)
+    np.testing.assert_array_equal(found, bridged(leaf_keys, returns.keys, returns.counts, max_cells, 3))
+    assert found.tolist() == sorted(expected | set(leaf_keys.tolist()))

@@ -99,18 +99,14 @@ def test_neighbours_cover_half_a_halo_of_a_missing_tile(folder, city, points, tm
     np.testing.assert_allclose(lacking.sdf(owned[seen]), city.sdf(owned[seen]), atol=0.1)
 
 
-def near_borders(points, offset_m=0.0):
-    """Points of the surface moved to or near the borders between tiles along y, which the wall crosses."""
-    distance_m = points[:, 1] - np.round(points[:, 1] / TILE_M) * TILE_M
-    moved = points[np.abs(distance_m - offset_m) < 0.3].copy()
-    moved[:, 1] = np.round(moved[:, 1] / TILE_M) * TILE_M + offset_m
-    return moved
-
-
 # The border itself, inside the overlap, and where weights start to rise.
 @pytest.mark.parametrize("offset_m", [0.0, 1.7, 3.2, -3.2])
 def test_distances_are_continuous_across_tiles(city, points, offset_m):
-    border, step = near_borders(points, offset_m), np.array([0, 1e-5, 0])
+    # Points of the surface moved to or near the borders between tiles along y, which the wall crosses.
+    border_m, step = np.round(points[:, 1] / TILE_M) * TILE_M, np.array([0, 1e-5, 0])
+    near = np.abs(points[:, 1] - border_m - offset_m) < 0.3
+    border = points[near].copy()
+    border[:, 1] = border_m[near] + offset_m
     border = border[city.observed(border - step) & city.observed(border + step)]
     assert len(border) > 20
     assert np.abs(city.sdf(border + step) - city.sdf(border - step)).max() < 1e-3
