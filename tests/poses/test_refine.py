@@ -166,6 +166,9 @@ def test_wrong_arguments_are_refused(street):
         radarsdf.refine_poses(points, poses, times_s=[0.0])
     with pytest.raises(ValueError, match="ascend"):
         radarsdf.refine_poses(points, poses, times_s=[0.0, 2, 1])
+    for wrong in ([True] * 3, [True, False], [1, 0, 0]):
+        with pytest.raises(ValueError, match="fixed must be"):
+            radarsdf.refine_poses(points, poses, fixed=wrong)
 
 
 def test_unusable_scans_are_excluded():
@@ -302,7 +305,17 @@ def test_the_faces_of_a_wall_do_not_attract_each_other():
 
 def test_fixed_poses_are_kept():
     wall = radarsdf.simulate.wall(frames=6)
-    given, fixed = drifted(wall.poses, 0.1, 0.01, 1), np.arange(6) == 2
+    given, fixed = drifted(wall.poses, 0.1, 0.01, 3), np.arange(6) == 3
     refined = radarsdf.refine_poses(wall.points, given, fixed=fixed)
     assert refined.improved
     assert ((refined.poses == given).all(axis=(1, 2)) == fixed).all()
+    assert normalised_errors(refined, wall.poses).mean() < 3  # 27 if the others ignore it
+    free, none = (radarsdf.refine_poses(wall.points, given, fixed=f) for f in (None, np.zeros(6, bool)))
+    np.testing.assert_array_equal(none.covariance, free.covariance)
+
+
+def test_a_fixed_pose_has_no_covariance_even_if_all_are_kept():
+    wall = radarsdf.simulate.wall(frames=6)
+    kept = radarsdf.refine_poses(wall.points, drifted(wall.poses, 0.1, 0.01, 2), fixed=[True] + 5 * [False])
+    assert not kept.improved
+    assert np.abs(kept.covariance[0]).max() < 1e-8

@@ -185,8 +185,8 @@ class RefinedPoses:
     """(F, 4, 4) T_world_sensor, of a rig T_world_body: the refined poses if they are an improvement, else the given ones. Mean position and mean
     rotation are those of the given poses, unless some are fixed."""
     covariance: Floats
-    """(F, 6, 6) of `poses`, relative to the middle scan: translation, m, and rotation vector about the sensor, rad, in world
-    axes. Conservative for loops of more than 32 scans."""
+    """(F, 6, 6) of `poses`, relative to the middle scan or the fixed ones: translation, m, and rotation vector about the sensor,
+    rad, in world axes. Conservative for loops of more than 32 scans."""
     improved: bool
     """Whether held-out returns agree better with those of other scans, at a significance level of 0.001."""
     report: dict[str, Any]
@@ -253,12 +253,10 @@ def refine_poses(
     poses = filled(points, poses=poses)[2]
     rig, radars = CheckedScans.of_radars(points, doppler_mps, times_s)
     given, rigid = usable_poses(poses, sum(len(checked.rows) for checked in radars))
-    anchor = None
-    if fixed is not None:
-        kept = np.asarray(fixed)
-        masks = kept.shape == (len(given),) and kept.dtype == bool and not kept.all()
-        check(masks, f"fixed must be one bool for each of {len(given)} poses, not all of them True")
-        anchor = _FixedPoses(given, kept)
+    kept = np.zeros(len(given), bool) if fixed is None else np.asarray(fixed)
+    masks = kept.shape == (len(given),) and kept.dtype == bool and (fixed is None or not kept.all())
+    check(masks, f"fixed must be one bool for each of {len(given)} poses, not all of them True")
+    anchor = _FixedPoses(given, kept) if kept.any() else None
     joined = join_radars(rig, [_compare_doppler(checked, given, rig) for checked in radars])
     scans, times, velocities, notes = joined.scans, joined.times_s, joined.velocities, joined.notes
     if not rigid.all():
@@ -278,8 +276,7 @@ def refine_poses(
     held, used = _held_out(returns, config.seed)
     estimator = JointEstimator(used, motions, cell_m, config)
     found = estimator.estimate_closed(given, far=True, progress=progress, anchor=anchor)
-    if anchor is not None:  # to the bit
-        found.poses[anchor.fixed] = given[anchor.fixed]
+    found.poses[kept] = given[kept]  # to the bit
     verdict = Verdict.of(held, used, given, found.poses, found.noise)
     still_open = open_loops(used, found.poses, found.noise)
     if not still_open and any(visits(float(np.median(used.ranges_m)), found.poses)):
@@ -304,8 +301,8 @@ def refine_poses(
     if verdict.improved:
         return RefinedPoses(found.poses, found.covariance, True, report)
     # Neither trajectory is rejected, so the errors of the given one may be as large as their difference.
-    middle = len(given) // 2
-    placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found.poses[middle]), found.poses)
+    at = kept.argmax() if kept.any() else len(given) // 2
+    placed = np.einsum("ij,fjk->fik", given[at] @ np.linalg.inv(found.poses[at]), found.poses)
     off = increments(given, placed)
     return RefinedPoses(given, found.covariance + np.einsum("fi,fj->fij", off, off), False, report)
 
