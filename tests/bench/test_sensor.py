@@ -56,16 +56,6 @@ EXPECTED = {
 }
 
 
-def misfits(found: dict[str, float]) -> dict[str, float]:
-    """Ratios of simulated to expected statistics that are missing or differ by more than their factor."""
-    ratios = {name: found[name] / expected.value for name, expected in EXPECTED.items()}
-    return {
-        name: ratio
-        for name, ratio in ratios.items()
-        if not 1 / EXPECTED[name].factor <= ratio <= EXPECTED[name].factor
-    }
-
-
 @pytest.fixture(scope="module")
 def simulation():
     found = SCENES["astyx"](seed=SEED)
@@ -78,4 +68,7 @@ def drive(simulation):
 
 
 def test_the_simulation_is_as_noisy_as_the_drives(drive):
-    assert misfits(figures(drive)) == {}
+    found = figures(drive)
+    ratios = {name: found[name] / expected.value for name, expected in EXPECTED.items()}
+    allowed = {name: expected.factor for name, expected in EXPECTED.items()}
+    assert {name: r for name, r in ratios.items() if not 1 / allowed[name] <= r <= allowed[name]} == {}

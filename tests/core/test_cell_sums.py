@@ -170,11 +170,10 @@ def along(points, directions):
 def test_points_along_rays_insert_their_cells(count, threads):
     points, directions = rays_of(count)
     expected = np.unique(cell_keys(along(points, directions), LEAF_M))
-    for cells, insert in ((CellSet(LEAF_M), "along"), (CellSet(LEAF_M), "points")):
-        if insert == "along":
-            cells.insert_along(points, directions, OFFSETS_M, threads)
-        else:
-            cells.insert(along(points, directions), threads)
+    by_rays, by_points = CellSet(LEAF_M), CellSet(LEAF_M)
+    by_rays.insert_along(points, directions, OFFSETS_M, threads)
+    by_points.insert(along(points, directions), threads)
+    for cells in (by_rays, by_points):
         np.testing.assert_array_equal(cells.sorted_keys(threads), expected)
         assert len(cells) == len(expected)
 

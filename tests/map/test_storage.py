@@ -41,12 +41,6 @@ def write(path, tensors, metadata):
     return path
 
 
-def with_description(metadata, change):
-    description = json.loads(metadata["description"])
-    change(description)
-    return metadata | {"description": json.dumps(description)}
-
-
 @pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
 @pytest.mark.parametrize("with_intensity", [True, False])
 def test_a_loaded_map_is_bit_identical(scene, tmp_path, encoding, with_intensity):
@@ -210,7 +204,10 @@ DAMAGE = {
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_inconsistent_metadata_are_rejected(saved, tmp_path, damage):
     _, _, tensors, metadata = saved
-    path = write(tmp_path / "bad.safetensors", tensors, with_description(metadata, DAMAGE[damage]))
+    description = json.loads(metadata["description"])
+    DAMAGE[damage](description)
+    damaged = metadata | {"description": json.dumps(description)}
+    path = write(tmp_path / "bad.safetensors", tensors, damaged)
     with pytest.raises(ValueError, match="is not a complete radarsdf map"):
         radarsdf.load(path)
 
