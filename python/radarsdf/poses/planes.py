@@ -11,7 +11,7 @@ from radarsdf._core import CellBlocks, CommonPlanes, LocalPlanes
 from radarsdf.arrays import Bools, Floats, Floats32, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.rigid import increments, moved
-from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import merged_keys
@@ -166,13 +166,15 @@ def common_planes(
         centres.append(surfels.centres)
         normals.append(unbiased_normals(surfels, num_threads))
         if noise is None:
-            noises.append(sensor_noise(surfels, part, config, num_threads))
-    known = SensorNoise.median(noises) if noise is None else noise
+            estimate = sensor_noise if returns.rig is None else rig_noise
+            noises.append(estimate(surfels, part, config, num_threads))
+    if noise is None:  # of short windows, that of all radars
+        noise = noises[0] if len(noises) == 1 else SensorNoise.median(noises)
     of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, planes
     of_scans = poses[:, :3, 3] - rays.origin, rays.up_of_scan
     of_planes = np.concatenate(centres), np.ascontiguousarray(np.concatenate(normals))
     together = min(window, _TOGETHER), num_threads
-    return CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, known.of_scans(rays), *together), known
+    return CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, noise.of_scans(rays), *together), noise
 
 
 def planes_of(rays: Rays, surfels: Surfels, num_threads: int) -> Ints32:

@@ -293,7 +293,7 @@ def refine_poses(
         "bias": found.motions[0].bias.tolist(),
         "moved_m": float(np.sqrt(((found.poses - given)[:, :3, 3] ** 2).sum(axis=1).mean())),
         "moved_rad": float(np.sqrt((turned_by(given, found.poses) ** 2).mean())),
-        "noise": vars(found.noise).copy(),
+        "noise": vars(found.noise.mean).copy(),
         "moving": joined.moving,
         "rounds": found.rounds,
         "seconds": time.perf_counter() - begin,

@@ -42,7 +42,7 @@ class SensorNoise:
 
     @classmethod
     def median(cls, noises: "Sequence[SensorNoise]") -> "SensorNoise":
-        return cls(*np.median([dataclasses.astuple(noise) for noise in noises], axis=0).tolist())
+        return cls(*np.median([noise.deviations for noise in noises], axis=0).tolist())
 
     @property
     def deviations(self) -> list[float]:
