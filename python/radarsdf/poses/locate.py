@@ -31,6 +31,7 @@ _FEWEST = 6  # scans to search
 # other surfaces: 0.64; of others 0.8 to 1.
 _LEAST_AGREEING = 0.75
 _PLACE_RAD = 0.1  # standard deviation of the rotation of a place that was found
+_HEIGHT_M = 2.0  # of its height, m, as in the search, which compares only the best height of each place
 _GUESS_SIGMAS = np.repeat([0.5, 0.05], 3)  # standard deviations of a guess, m and rad
 
 # A scan, its pose (4, 4) as found, and standard deviations (6,) of that.
@@ -192,9 +193,9 @@ class _Localiser:
         poses, kept = self._follow(planes, thinned, poses, rows, submap)
         rows, poses, thinned = rows[kept], poses[kept], thinned[kept]
         scans, rig = scans[kept], None if rig is None else rig.select(kept)
-        # The place is known to the capture range of the planes: nothing is alike farther away.
+        # The horizontal place is known to the capture range of the planes: nothing is alike farther away.
         row = (submap.start + submap.stop) // 2 - kept.start
-        near = row, poses[row], np.repeat([planes.capture_m, _PLACE_RAD], 3)
+        near = row, poses[row], np.array([planes.capture_m] * 2 + [_HEIGHT_M] + [_PLACE_RAD] * 3)
         if first is not None:
             near = 0, first, _GUESS_SIGMAS
         anchor = self._anchor(noise, thinned, poses, 1.5 * reach_m, near)
