@@ -236,7 +236,6 @@ class _Shown:
 
 
 def _conclude(results: Results, done: Replay, live_map: LiveMap) -> None:
-    """Add counts and times, and close the loops of the map."""
     check(done.integrated, "; ".join(["no scan was integrated into the map", *done.notes]))
     scans = done.integrated + done.dropped + done.lost
     line = f"{done.integrated} of {scans} scans in the map, {done.dropped} dropped, {done.lost} lost"

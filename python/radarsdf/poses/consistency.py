@@ -307,9 +307,8 @@ class Consistency:
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if they are contradicted; and notes."""
         if velocities.offset is not None:
-            mps, first, last = velocities.offset
-            added = f"{mps:.2f} m/s are added to that of all returns from scan {first} to {last}"
-            return None, [f"{NOT_USED}: {added}."]
+            added = "{:.2f} m/s are added to that of all returns from scan {} to {}."
+            return None, [f"{NOT_USED}: {added.format(*velocities.offset)}"]
         if (why := self.contradiction) is not None:
             remedy = " Give each scan its own." if self.delay else ""
             if self.source == "the poses":

@@ -11,8 +11,8 @@ from radarsdf.arrays import Bools, Floats
 from radarsdf.poses.rigid import rotation, rotation_vector, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # weight of the initial motion prior, steps
-# Steps over which changes are measured. A smooth motion changes more over several than a random walk of its single steps, and those of
-# a rig are short: the largest spectral density counts. Errors of odometry: of one radar 3 % smaller, of three 10 to 20 %.
+# Steps over which changes are measured. A smooth motion changes more over several than a random walk of its single steps: the largest
+# spectral density counts. Errors of odometry by three radars are 9 to 18 % smaller.
 _LAGS = 1, 2, 4, 8, 16
 _SPAN = 4.0  # width of a search, standard deviations
 _FEWEST, _MOST = 64, 8192  # limits of the number of poses of a search
@@ -91,7 +91,6 @@ class MotionRate:
     covariance: Floats  # (3, 3)
 
     def integrate(self, duration_s: float) -> "MotionRate":
-        """Return the motion at this constant rate, with its covariance."""
         return MotionRate(self.mean * duration_s, self.covariance * duration_s**2)
 
 
@@ -283,8 +282,7 @@ class SteadyMotion(Motion):
     def updated(self, poses: Floats, *_: Floats) -> Self:
         """Predict each step of `poses` from its neighbours."""
         durations_s = self.durations_s[:, None]
-        # Between radars that measure almost at once, no rate is measured: that of the step before holds. As rates of 0, such steps
-        # bent both ends of the drives of rigs of three by up to 5 degrees.
+        # Radars that measure almost at once show no rate: as rates of 0, such steps bent both ends of a drive by 5 degrees.
         timed = self.durations_s >= _LEAST_SPAN * usual_duration_s(self.durations_s)
         vectors, own_s = step_vectors(poses)[timed], self.durations_s[timed]
         rates = np.split(vectors / own_s[:, None], 2, axis=1)

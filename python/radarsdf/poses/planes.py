@@ -300,7 +300,7 @@ class PlaneMap:
             hessian = self._information(scans, shifted)
             variance = axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis
             information.append(1 / float(variance) if variance > 0 else 0.0)
-        if max(information) > information[0]:  # no more than by chance, which the mean of few shifts underestimates
+        if max(information) > information[0]:  # by chance, which the mean of few shifts underestimates
             return 1.0
         return float(np.mean(information[1:])) / max(information[0], 1e-12)
 

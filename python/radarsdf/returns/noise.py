@@ -1,8 +1,7 @@
 """Noise of the sensor, estimated from its returns, and noise reduction by moving returns onto planes."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -208,4 +207,4 @@ def onto_surfels(
     moved_onto = move_onto_planes(*of_rays, *planes, noise.of_scans(rays), kept, num_threads)
     points, directions, ranges_m = moved_onto
     rest = rays if kept is None else rays.select(kept)
-    return dataclasses.replace(rest, points=points, directions=directions, ranges_m=ranges_m)
+    return replace(rest, points=points, directions=directions, ranges_m=ranges_m)
