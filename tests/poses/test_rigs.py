@@ -12,6 +12,7 @@ from radarsdf.poses.rigid import aligned, rotation, turned_by
 from radarsdf.rig import Rig
 from radarsdf.simulate import drifted, measured_imu
 
+from scenes.kinds import KINDS
 from scenes.rigs import FRAME_S, drive_of_rig
 
 from .drift import first
@@ -136,3 +137,12 @@ def test_mountings_are_required(scans):
         radarsdf.odometry(unmounted)
     with pytest.raises(ValueError, match="T_body_sensor"):
         radarsdf.refine_poses(unmounted)
+
+
+def test_a_radar_that_turns_fast_from_the_start_is_not_placed_as_if_it_began_at_rest():
+    """At 57 degrees a second, the first scan was 16 degrees off."""
+    scans = drive_of_rig(KINDS["hall"](seed=2, frames=30), ["side"], seed=2).scans
+    found = radarsdf.odometry(scans.points, times_s=scans.times_s, doppler_mps=scans.doppler_mps)
+    true = scans.sensor_poses
+    first = found.poses[20] @ np.linalg.inv(true[20]) @ true[0]
+    assert np.degrees(turned_by(found.poses[:1], first[None]))[0] < 4

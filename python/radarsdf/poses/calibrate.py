@@ -51,6 +51,7 @@ _FEWEST = 3  # returns of a radar on a plane that it shares with others
 # simulated drives with ghosts: without it, errors are 3 times their deviations, and Doppler is overruled.
 _IN_COMMON = 10.0
 _SIGMAS2 = 4.0  # squared scale of the Geman-McClure weight
+_BENT = 10.0  # most changes that count, medians: a straight path may bend at its ends, where an offset wrong by 70 ms was known to 3
 _SLOW = 0.001  # standard deviation of slowly changing errors of velocities, share of the speed
 _DIFFERENCE = 1e-3  # of numeric derivatives: m, rad, s
 _LEAST_CHANGE = 1e-3  # m/s and rad/s, between knots
@@ -293,6 +294,7 @@ def estimate_mountings(
     at_s, apart_s = np.linspace(0.0, radars.times_s[-1], 2 * len(path.positions), retstep=True)
     v = path.motion(at_s).v
     change = np.linalg.norm(np.diff(v, axis=0), axis=1) / apart_s
+    change = np.minimum(change, _BENT * np.median(change))
     slow_s = _SLOW * np.linalg.norm(v, axis=1).mean() / np.sqrt((change**2).mean())
     covariance[information[:, 6] < _FIXED, 6, 6] += slow_s**2
     return path, covariance

@@ -70,7 +70,7 @@ def close_loop(
     `planes`: an empty map, to which the earlier scans are added. The joint estimate from the returned poses closes the loop if it is one.
     """
     later, earlier = visit
-    path_m, range_m = _path_m(poses), float(np.median(returns.ranges_m))
+    path_m, range_m = np.append(0.0, lengths_of_steps_m(poses).cumsum()), float(np.median(returns.ranges_m))
     later = np.arange(max(later[-1] - _SCANS + 1, 0), later[-1] + 1)
     own, begin_m = poses[later[len(later) // 2]], path_m[earlier[-1]]
     between_m = path_m[later[0]] - begin_m
@@ -101,13 +101,9 @@ def close_loop(
     return moved(poses, np.concatenate([moved_m, turned], axis=1))
 
 
-def _path_m(poses: Floats) -> Floats:
-    return np.concatenate([[0.0], np.cumsum(lengths_of_steps_m(poses))])
-
-
 def visits(range_m: float, poses: Floats) -> Iterator[tuple[Ints, Ints]]:
     """Yield the scans of each later visit of a place, and those of earlier ones, given the median range."""
-    path_m = _path_m(poses)
+    path_m = np.append(0.0, lengths_of_steps_m(poses).cumsum())
     _, first, part = np.unique(np.floor(path_m / (_PART * range_m)), return_index=True, return_inverse=True)
     pairs = cKDTree(poses[first, :3, 3]).query_pairs(_SAME_PLACE * range_m, output_type="ndarray")
     pairs = pairs[path_m[first[pairs[:, 1]]] - path_m[first[pairs[:, 0]]] > _AWAY * range_m]

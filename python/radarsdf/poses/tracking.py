@@ -178,6 +178,7 @@ class Drive:
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
     # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
     steady: Priors = MOVES, TURNS
+    first_turn: MotionRate | None = None  # learnt: from 0, scans at 1 rad/s began 16 degrees off
     inertial: Inertial = field(default_factory=Inertial)
     yaws: Floats | None = None  # as :attr:`CheckedScans.yaws`
     rig: Rig | None = None  # of several radars. The poses are those of its body
@@ -248,7 +249,7 @@ class Drive:
         return [*motions, DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns)]
 
 
-Rates = tuple[MotionRate, MotionRate] | tuple[None, None]  # rotation, rad/s, and translation, m/s, if known
+Rates = tuple[MotionRate | None, MotionRate | None]  # rotation, rad/s, and translation, m/s, if known
 
 
 def track_drive(
@@ -269,7 +270,8 @@ def track_drive(
         steady_moves = moves.learnt(move_rates, durations_s, with_errors=True)
         steady_turns = turns.learnt(turn_rates, durations_s, with_errors=True)
         turns, moves = turns.learnt(turn_rates, durations_s), moves.learnt(move_rates, durations_s)
-        drive = replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns))
+        turn = turns.after(next(reversed(turn_rates[:WINDOW]), None), float(durations_s[:WINDOW].sum()))
+        drive = replace(drive, turns=turns, moves=moves, steady=(steady_moves, steady_turns), first_turn=turn)
         if i == 0 and isinstance(drive.velocities, BodyVelocities):
             drive = replace(drive, velocities=drive.velocities.learnt(turn_rates))
         if i == 0:
@@ -282,7 +284,7 @@ def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rate
     """Track all scans in one pass; return them, and the rates of each step."""
     tracked: list[Tracked] = []
     rates: list[Rates] = []
-    last: Rates = None, None
+    last: Rates = drive.first_turn, None
     for i, scan in enumerate(drive.scans):
         predicted = drive.predict(i, *last) if i else None
         now = Tracked(np.eye(4)) if predicted is None else tracker.register(scan, predicted)
