@@ -6,7 +6,7 @@ import threading
 import weakref
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from operator import itemgetter
+from operator import attrgetter
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -200,14 +200,14 @@ class LiveMap:
             found = self._state.log.placed(scan_id)
             if found is None:
                 raise KeyError(scan_id)
-            return found[0].copy()
+            return found.pose.copy()
 
     def trajectory(self) -> tuple[Floats, Floats]:
         """Return the times (F,), s, NaN where unknown, and the poses (F, 4, 4) of the scans of :attr:`scan_ids`."""
         with self._owned(changes=False):
             known = self._state.log.trajectory()
-        times_s = np.array([time_s for _, _, time_s, _ in known], np.float64)  # NaN for None
-        return times_s, np.array([pose for _, pose, *_ in known]).reshape(-1, 4, 4)
+        times_s = np.array([placed.time_s for placed in known], np.float64)  # NaN for None
+        return times_s, np.array([placed.pose for placed in known]).reshape(-1, 4, 4)
 
     def integrate(
         self,
@@ -298,8 +298,9 @@ class LiveMap:
         rows = np.flatnonzero((found.segments == found.segments[-1]) & (found.segments >= 0))
         if len(rows) == 0:
             raise lost
-        placed = [dataclasses.replace(scans[i], tracked=True) for i in rows]
-        return [(scan, found.poses[i], self._unplaced[i][0]) for i, scan in zip(rows, placed, strict=True)]
+        return [
+            (dataclasses.replace(scans[i], tracked=True), found.poses[i], self._unplaced[i][0]) for i in rows
+        ]
 
     def _integrate(
         self, scan: LoggedScan, given: Floats | None, scan_id: ScanId | None, far: int
@@ -378,10 +379,10 @@ class LiveMap:
         with self._owned():
             self._check_unsealed()
             log = self._state.log
-            timed = sorted((row for row in log.trajectory() if row[2] is not None), key=itemgetter(2))
-            if not any(tracked for *_, tracked in timed):
+            timed = [placed for placed in log.trajectory() if placed.time_s is not None]
+            if not any(placed.tracked for placed in timed):
                 return NO_KEYS
-            ids, given, times_s, tracked = zip(*timed, strict=True)
+            ids, given, times_s, tracked = zip(*sorted(timed, key=attrgetter("time_s")), strict=True)
             some, poses = ids[:: 1 + len(ids) // _RANGED], np.stack(given)
             range_m = median_range_m([log.get(scan_id).static.points for scan_id in some])
             if not any(visits(range_m, poses)):
@@ -395,11 +396,11 @@ class LiveMap:
             now = self._state.log
             if not refined.improved or now.edits != log.edits:
                 return NO_KEYS
-            moved = dict(zip(ids, refined.poses, strict=True))
+            known = dict(zip(ids, refined.poses, strict=True))
+            drifted = [placed for placed in now.trajectory() if placed.tracked]
+            moved = {placed.scan_id: known.get(placed.scan_id, T @ placed.pose) for placed in drifted}
             come = {
-                scan_id: dataclasses.replace(now.get(scan_id), pose=moved.get(scan_id, T @ pose))
-                for scan_id, pose, _, is_tracked in now.trajectory()
-                if is_tracked
+                scan_id: dataclasses.replace(now.get(scan_id), pose=pose) for scan_id, pose in moved.items()
             }
             return self._state.exchange(come, come)
 

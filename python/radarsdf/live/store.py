@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -90,6 +90,15 @@ class LoggedScan:
     @property
     def num_bytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
+
+
+class Placement(NamedTuple):
+    """What a log knows of a scan without reading its returns."""
+
+    scan_id: ScanId
+    pose: Floats  # (4, 4), as of the scan
+    time_s: float | None
+    tracked: bool
 
 
 def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
@@ -176,27 +185,23 @@ class ScanLog:
     @property
     def ids(self) -> list[ScanId]:
         """Identifiers of the scans that can be removed."""
-        return [scan_id for scan_id, *_ in self.trajectory()]
+        return [placed.scan_id for placed in self.trajectory()]
 
-    def trajectory(self) -> list[tuple[ScanId, Floats, float | None, bool]]:
-        """Return id, pose (4, 4), time, s, and whether tracked, of the scans that can be removed, in order, without reading their returns."""
+    def trajectory(self) -> list[Placement]:
+        """Return the placements of the scans that can be removed, in order."""
         columns = "number, id, pose, time_s, tracked FROM scans WHERE number < ? ORDER BY place"
         stored = self._rows.read(columns, self._end) if self._stored else []
-        stored = [row for row in stored if row[0] not in self._gone]
-        return [
-            *(
-                (scan_id, _pose_of(pose), time_s, bool(tracked))
-                for _, scan_id, pose, time_s, tracked in stored
-            ),
-            *((scan_id, scan.pose, scan.time_s, scan.tracked) for scan_id, scan in self._scans.items()),
-        ]
+        placed = [_placement(*row) for number, *row in stored if number not in self._gone]
+        for scan_id, scan in self._scans.items():
+            placed.append(Placement(scan_id, scan.pose, scan.time_s, scan.tracked))
+        return placed
 
-    def placed(self, scan_id: ScanId) -> tuple[Floats, float | None] | None:
-        """Return pose (4, 4) and time, s, of a scan, without reading its returns. None if it cannot be removed."""
-        row, held = self._row(scan_id), self._scans.get(scan_id)
-        if row is not None:
-            return _pose_of(row[2]), row[3]
-        return None if held is None else (held.pose, held.time_s)
+    def placed(self, scan_id: ScanId) -> Placement | None:
+        """Return the placement of a scan. None if it cannot be removed."""
+        if (row := self._row(scan_id, "tracked")) is not None:
+            return _placement(scan_id, *row[2:])
+        held = self._scans.get(scan_id)
+        return None if held is None else Placement(scan_id, held.pose, held.time_s, held.tracked)
 
     def get(self, scan_id: ScanId) -> LoggedScan:
         """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
@@ -287,6 +292,10 @@ class ScanLog:
             if np.linalg.norm(scan.T_world_sensor[:3, 3] - centre) + reach_m > radius_m:
                 sealed.append(scan_id)
         return self._without(sealed, sealed=True)
+
+
+def _placement(scan_id: ScanId, pose: bytes, time_s: float | None, tracked: int) -> Placement:
+    return Placement(scan_id, _pose_of(pose), time_s, bool(tracked))
 
 
 def _pose_of(blob: bytes) -> Floats:

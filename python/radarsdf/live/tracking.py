@@ -413,11 +413,11 @@ def _now(step: Step, log: ScanLog) -> Step | None:
     if step.scan_id in log.sealed:
         return step
     placed = log.placed(step.scan_id)
-    if placed is None or placed[1] != step.logged.time_s:  # another scan of this id
+    if placed is None or placed.time_s != step.logged.time_s:  # another scan of this id
         return None
-    if (placed[0] == step.found.pose).all():
+    if (placed.pose == step.found.pose).all():
         return step
-    found = dataclasses.replace(step.found, pose=placed[0], covariance=_GIVEN)
+    found = dataclasses.replace(step.found, pose=placed.pose, covariance=_GIVEN)
     return dataclasses.replace(step, found=found, given=True)
 
 
