@@ -299,7 +299,7 @@ class Verdict(Gain):
             return cls(0.0, np.inf, 0)
         held = held.every(-(-len(held) // _MOST_HELD))
         gains = _gains(held, used, before, after, noise)
-        edge_m = _PLACE * float(np.median(held.ranges_m))
+        edge_m = _PLACE * held.median_range_m
         cells = np.floor(held.posed(before).points / edge_m)
         places = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
         by_scans = Gain.by_groups(gains, held.scans)
@@ -350,7 +350,7 @@ def median_apart_m(distances_m: Floats, others: Bools) -> float:
 
 def _crowding(held: SensorReturns, used: SensorReturns, before: Floats, after: Floats) -> Floats:
     """Return the increase (N,) of the log number of other scans' returns in the cell of each held-out return."""
-    edge_m = _NEARBY * float(np.median(held.ranges_m))
+    edge_m = _NEARBY * held.median_range_m
     used = used.every(-(-len(used) // _MOST_COUNTED))
     counts = []
     for poses in (before, after):

@@ -31,7 +31,7 @@ _FEWEST = 6  # scans to search
 # other surfaces: 0.64; of others 0.8 to 1.
 _LEAST_AGREEING = 0.75
 _PLACE_RAD = 0.1  # standard deviation of the rotation of a place that was found
-_HEIGHT_M = 2.0  # of its height, m, as in the search, which compares only the best height of each place
+_HEIGHT_M = 2.0  # of its height, m: the search compares only the best height of each place
 _GUESS_SIGMAS = np.repeat([0.5, 0.05], 3)  # standard deviations of a guess, m and rad
 
 # A scan, its pose (4, 4) as found, and standard deviations (6,) of that.

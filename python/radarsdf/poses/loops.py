@@ -31,7 +31,7 @@ _PASSES = 3  # of Gauss-Newton, coarse to fine
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
     """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted."""
-    revisited = visits(float(np.median(returns.ranges_m)), poses)
+    revisited = visits(returns.median_range_m, poses)
     returns = returns.every(-(-len(returns) // _MOST_RETURNS))
     points = returns.posed(poses).points.astype(np.float64)
     variances_m2 = noise.mean_variances_m2(returns.ranges_m)
@@ -70,7 +70,7 @@ def close_loop(
     `planes`: an empty map, to which the earlier scans are added. The joint estimate from the returned poses closes the loop if it is one.
     """
     later, earlier = visit
-    path_m, range_m = np.append(0.0, lengths_of_steps_m(poses).cumsum()), float(np.median(returns.ranges_m))
+    path_m, range_m = np.append(0.0, lengths_of_steps_m(poses).cumsum()), returns.median_range_m
     later = np.arange(max(later[-1] - _SCANS + 1, 0), later[-1] + 1)
     own, begin_m = poses[later[len(later) // 2]], path_m[earlier[-1]]
     between_m = path_m[later[0]] - begin_m

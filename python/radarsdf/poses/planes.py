@@ -113,6 +113,10 @@ class SensorReturns:
     def __len__(self) -> int:
         return len(self.scans)
 
+    @property
+    def median_range_m(self) -> float:
+        return float(np.median(self.ranges_m))
+
     def select(self, part: Bools) -> "SensorReturns":
         return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part], self.rig)
 

@@ -120,7 +120,7 @@ class JointEstimator:
     ) -> PosesEstimate:
         """:meth:`estimate`, and close the loops that are beyond the reach of its planes."""
         found = self.estimate(given, far=far, progress=progress, anchor=anchor)
-        for visit in visits(float(np.median(self.returns.ranges_m)), found.poses):
+        for visit in visits(self.returns.median_range_m, found.poses):
             planes = PlaneMap(self.cell_m, found.noise.variances)
             start = close_loop(self.returns, found.poses, visit, planes, self.config.num_threads)
             if start is None:
@@ -279,7 +279,7 @@ def refine_poses(
     found.poses[kept] = given[kept]  # to the bit
     verdict = Verdict.of(held, used, given, found.poses, found.noise)
     still_open = open_loops(used, found.poses, found.noise)
-    if not still_open and any(visits(float(np.median(used.ranges_m)), found.poses)):
+    if not still_open and any(visits(used.median_range_m, found.poses)):
         # Scans that close a loop come closer together: that of a lap of a car park, open by 1.4 m, was kept.
         verdict = replace(verdict, crowding=0.0)
     notes += still_open if verdict.improved else open_loops(used, given, found.noise)
