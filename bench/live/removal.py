@@ -1,6 +1,7 @@
 """Removal and correction of scans in random order: bits and time."""
 
 import argparse
+import itertools
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -71,6 +72,4 @@ def _times(items: Iterable[int], act: Callable[[int], Any]) -> list[float]:
 def state(live: LiveMap) -> list[bytes]:
     """Bytes of all sums."""
     keys = live._state.sums.block_keys()
-    return [
-        array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.visibility_of(keys))
-    ]
+    return [array.tobytes() for array in itertools.chain(*live._state.sums.columns(keys))]

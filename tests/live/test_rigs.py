@@ -31,6 +31,11 @@ def test_scans_at_poses_of_the_body_are_those_of_a_fit(scans, tmp_path):
     live = LiveMap(config, T_body_sensor=scans.T_body_sensor, folder=tmp_path / "scans", max_bytes=200_000)
     for i in range(8):
         integrate(live, scans, i, scans.poses[i])
+        if i == 3:
+            live.mesh()  # estimates the noise of each radar, and again with twice as many scans
+    weighted = live.map().mesh(config.leaf_size_m)
+    meshes = (np.unique(mesh.vertices, axis=0) for mesh in (live.mesh(), weighted))
+    np.testing.assert_array_equal(*meshes)
     chosen = scans.select(range(8))
     fitted = radarsdf.fit(chosen, config=config)
     vertices = fitted.mesh(0.2).vertices

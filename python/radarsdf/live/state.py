@@ -1,32 +1,32 @@
 """State of a live map, and its changes."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from radarsdf._core import QUANTA, GrowingSums, SumsChange
+from radarsdf._core import QUANTA, SumsChange
 from radarsdf.arrays import Array, Floats, Keys
 from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import FitInput
 from radarsdf.interrupts import at_once
 from radarsdf.live import store
-from radarsdf.live.store import Described, LoggedScan, ScanId, ScanLog, rig_of_scans
+from radarsdf.live.store import Described, LoggedScan, ScanId, ScanLog
+from radarsdf.live.sums import RadarSums
 from radarsdf.live.surface import NO_KEYS, REGION_BITS, REGION_CELLS, GrowingSurface, regions_of
 from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale
-from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sensor import Radars
 from radarsdf.returns.sums import ScanSums, lattice_of
-from radarsdf.rig import Label
+from radarsdf.rig import Label, Rig
 from radarsdf.threads import resolve_num_threads
 
 _Scans = dict[ScanId, LoggedScan]
@@ -62,7 +62,8 @@ class GrowingState:
         self.track = Track()
         self._away = NO_KEYS  # ascending keys of the regions on disk
         self._num_threads = resolve_num_threads(config.num_threads)
-        self.sums = GrowingSums()
+        self._labels: list[Label | None] = [None] if mountings is None else [*mountings]
+        self.sums = RadarSums(len(self._labels))
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
         self.next_id = 0
@@ -93,20 +94,23 @@ class GrowingState:
 
     def _apply(self, come: _Scans, gone: _Scans, new: dict[str, Any]) -> Keys:
         """Change the sums and set attributes atomically. Return the keys of the changed blocks."""
-        change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
+        edge_m = self.config.leaf_size_m
+        changes = [SumsChange(edge_m, edge_m / QUANTA) for _ in self._labels]
         for scans, sign in ((gone, -1), (come, 1)):
             for scan in scans.values():
-                rays = _rays_of([scan], self.config, self.origin if new["origin"] is None else new["origin"])
+                rays = self._rays_of([scan], self.origin if new["origin"] is None else new["origin"])
+                change = changes[self._labels.index(scan.label)]
                 change.collect(rays.points, rays.directions, rays.ranges_m, sign)
-        self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
-        return self._commit(partial(self.sums.apply, change), None, **new)
+        for change in changes:
+            self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
+        return self._commit(self.sums.apply(changes), None, **new)
 
-    def _commit(self, change: partial[Any], blocks: Keys | None, **new: Any) -> Keys:
-        """Change the sums and set attributes at once. Return the changed blocks: `blocks`, or those that `change` returns."""
+    def _commit(self, changes: list[partial[Any]], blocks: Keys | None, **new: Any) -> Keys:
+        """Change the sums and set attributes at once. Return the changed blocks: `blocks`, or those that `changes` return."""
         surface, self._surface = self._surface, None  # an interruption after the change discards it
         self.number += 1
-        result, _ = at_once(change, partial(vars(self).update, new))
-        changed = result[0] if blocks is None else blocks
+        *results, _ = at_once(*changes, partial(vars(self).update, new))
+        changed = reduce(np.union1d, [keys for keys, _ in results]) if blocks is None else blocks
         self._changed.update(changed.tolist())
         self._surface = surface
         return changed
@@ -130,7 +134,7 @@ class GrowingState:
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
         gone = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
         log = self.log.sealed_beyond(centre, radius_m)
-        return self._commit(partial(self.sums.erase, gone), gone, log=log)
+        return self._commit(self.sums.erase(gone), gone, log=log)
 
     @contextmanager
     def whole(self) -> Iterator[None]:
@@ -145,15 +149,15 @@ class GrowingState:
     def _bring_back(self, regions: Keys) -> None:
         regions = np.intersect1d(regions, self._away)
         if len(regions):
-            blocks, columns = store.read_regions(self.log.folder, regions)
+            blocks, columns = store.read_regions(self.log.folder, regions, len(self._labels))
             away = np.setdiff1d(self._away, regions)
-            self._commit(partial(self.sums.insert, *columns), blocks, _away=away)
+            self._commit(self.sums.insert(columns), blocks, _away=away)
             store.unlink_regions(self.log.folder, regions)
 
     def _put_away(self, regions: Keys) -> Keys:
         blocks, written = store.write_regions(self.log.folder, self.sums, regions)
         away = np.union1d(self._away, written)
-        return self._commit(partial(self.sums.erase, blocks), blocks, _away=away)
+        return self._commit(self.sums.erase(blocks), blocks, _away=away)
 
     def changes(self) -> tuple[GrowingSurface, tuple[Any, ...], VisibilityCounts]:
         """Return the last surface, the arguments of its update, and the visibility counts."""
@@ -168,7 +172,7 @@ class GrowingState:
         bits = REGION_BITS - BLOCK_BITS
         in_region = np.arange(1 << int(bits), dtype=np.uint64)
         in_regions = (np.unique(blocks >> bits) << bits)[:, None] | in_region
-        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(in_regions.ravel()))
+        sums = self.sums.weighted(in_regions.ravel(), self.config.leaf_size_m, self.noise)
         surface.complete = False
         self._changed.clear()
         return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
@@ -185,7 +189,7 @@ class GrowingState:
         described = Described(
             config=self.config.to_dict(),
             origin=None if self.origin is None else self.origin.tolist(),
-            noise=list(dataclasses.astuple(self.noise)),
+            noise=self.noise,
             noise_of=self._noise_of,
             next_id=self.next_id,
             with_intensities=self.with_intensities,
@@ -200,62 +204,66 @@ class GrowingState:
         )
         store.save_state(path, described, scans, self.sums)
 
-    def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[Array]) -> None:
-        self.sums.insert(*sums)
-        self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
+    def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[Sequence[Array]]) -> None:
+        at_once(*self.sums.insert(sums))
+        self.noise, self._noise_of = described.noise, described.noise_of
         self.next_id, self.with_intensities = described.next_id, described.with_intensities
         self.log = self.log.exchanged(dict(zip(described.ids, scans, strict=True)), ())
         self.log.sealed |= set(described.sealed)
         self._bound()
 
     def scans(self, every: int = 1) -> list[LoggedScan]:
-        """Return every n-th scan that is not sealed. Raise a ValueError if there are none."""
+        """Return one of every n scans that are not sealed. Raise a ValueError if there are none."""
         scans = list(self.log.scans(every))
         check(scans, "there are no scans to fit: integrate some first")
         return scans
 
     def fit_input(self) -> Callable[[], FitInput]:
         """Return a function for the input of a fit of all scans, with the incremental sums, and an even sample of many rays."""
-        sums, visibility, origin = self._all_sums(), self._visibility(), self.origin
+        sums, visibility, origin = self._all_sums(self.noise), self._visibility(), self.origin
         every = 1 + int(sums.counts.sum()) // _FIT_RETURNS
         scans, is_part = self.scans(every), every > 1 or bool(self.log.sealed)
 
         def read() -> FitInput:
-            rays = _rays_of(scans, self.config, origin).without_outliers()
+            rays = self._rays_of(scans, origin).without_outliers()
             poses = np.stack([scan.T_world_sensor for scan in scans])
             moving = sum(int((~scan.is_static).sum()) for scan in scans if scan.is_static is not None)
-            rays, radars = Radars.unify(rays, rig_of_scans(scans), self.config, self._num_threads)
-            # The sums do not weight returns by the noise of their radars, but have those of all scans.
+            rays, radars = Radars.unify(rays, self._rig_of(scans), self.config, self._num_threads)
+            # The sums weight returns by the noise when they were last derived, but have those of all scans.
             used = sums if radars is None or is_part else None
             scale = IntensityScale.of(rays.intensities)
             return FitInput(rays, scale, poses, moving, sums=used, radars=radars, visibility=visibility)
 
         return read
 
-    def _all_sums(self) -> ScanSums:
-        return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
+    def _all_sums(self, noise: SensorNoise) -> ScanSums:
+        return self.sums.weighted(self.sums.block_keys(), self.config.leaf_size_m, noise)
 
     def _visibility(self) -> VisibilityCounts:
-        return VisibilityCounts(*self.sums.visibility_of(self.sums.block_keys()))
+        return self.sums.visibility(self.sums.block_keys())
 
     def _settle_noise(self) -> None:
         """Estimate the sensor's noise if the number of scans has doubled or halved since the last time."""
         scans = len(self.log)
         if self._noise_of / 2 < scans < 2 * self._noise_of:
             return
-        sums = self._all_sums()
+        sums = self._all_sums(_UNKNOWN)
         asked = list(self.log.scans(every=max(1, int(sums.counts.sum()) // _NOISE_RETURNS)))
         if asked:
-            surfels = Surfels.of_sums(sums, self._num_threads)
-            rays = _rays_of(asked, self.config, self.origin)
-            noise = sensor_noise(surfels, rays, self.config.returns, self._num_threads)
+            estimate = sensor_noise if self.mountings is None else rig_noise
+            surfels, rays = Surfels.of_sums(sums, self._num_threads), self._rays_of(asked, self.origin)
+            noise = estimate(surfels, rays, self.config.returns, self._num_threads)
+            if self.mountings is not None:  # it weights all sums
+                self._changed.update(self.sums.block_keys().tolist())
             vars(self).update(noise=noise, _noise_of=scans)
 
+    def _rays_of(self, scans: Sequence[LoggedScan], origin: Floats | None) -> Rays:
+        """Return the rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
+        static = [scan.static for scan in scans]
+        poses = np.stack([scan.T_world_sensor for scan in static])
+        values = [scan.intensities for scan in static if scan.intensities is not None] or None
+        options = self.config.preparation | {"origin": origin, "whole": False, "rig": self._rig_of(static)}
+        return prepare([scan.points for scan in static], poses, values, **options)
 
-def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: Floats | None) -> Rays:
-    """Return the rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
-    static = [scan.static for scan in scans]
-    poses = np.stack([scan.T_world_sensor for scan in static])
-    values = [scan.intensities for scan in static if scan.intensities is not None] or None
-    options = config.preparation | {"origin": origin, "whole": False, "rig": rig_of_scans(static)}
-    return prepare([scan.points for scan in static], poses, values, **options)
+    def _rig_of(self, scans: Sequence[LoggedScan]) -> Rig | None:
+        return None if self.mountings is None else Rig.of([scan.label for scan in scans], self.mountings)

@@ -6,21 +6,23 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from radarsdf._core import GrowingSums
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Keys
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, check_values_of_scan, positions
 from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
+from radarsdf.live.sums import RadarSums
 from radarsdf.live.surface import REGION_BITS
 from radarsdf.returns.evidence import BLOCK_BITS
-from radarsdf.rig import Label, Mounted, Rig, checked_mountings
+from radarsdf.returns.noise import RigNoise, SensorNoise
+from radarsdf.rig import Label, Mounted, checked_mountings
 
 ScanId = Hashable
 # Arrays of a scan, and their types.
@@ -99,11 +101,6 @@ class Placement(NamedTuple):
     pose: Floats  # (4, 4), as of the scan
     time_s: float | None
     tracked: bool
-
-
-def rig_of_scans(scans: Sequence[LoggedScan]) -> Rig | None:
-    known = [scan.radar for scan in scans if scan.radar is not None]
-    return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
 
 class _Rows:
@@ -221,8 +218,11 @@ class ScanLog:
         return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted, tracked=bool(tracked))
 
     def scans(self, every: int = 1) -> Iterator[LoggedScan]:
-        """Iterate over every n-th scan that can be removed, in order."""
-        return (self.get(scan_id) for scan_id in self.ids[::every])
+        """Iterate over one of every n scans that can be removed, in order; at random, since radars may take turns."""
+        ids = self.ids
+        firsts = np.arange(0, len(ids), every)
+        rows = firsts + np.random.default_rng(0).integers(every, size=len(firsts))
+        return (self.get(ids[i]) for i in np.minimum(rows, len(ids) - 1))
 
     def exchanged(self, new: Mapping[ScanId, LoggedScan], old: Collection[ScanId]) -> "ScanLog":
         """Return a log without the scans `old`, and with those of `new`. Ids in both keep their place."""
@@ -307,7 +307,7 @@ def _region_paths(folder: Path | None, regions: Keys) -> list[Path]:
     return [(folder or Path()) / f"region-{region:016x}.npz" for region in regions.tolist()]
 
 
-def write_regions(folder: Path | None, sums: GrowingSums, regions: Keys) -> tuple[Keys, Keys]:
+def write_regions(folder: Path | None, sums: RadarSums, regions: Keys) -> tuple[Keys, Keys]:
     """Write those of `regions` that are in `sums`. Return the ascending keys of their blocks, and theirs."""
     blocks = sums.block_keys()
     region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
@@ -317,15 +317,15 @@ def write_regions(folder: Path | None, sums: GrowingSums, regions: Keys) -> tupl
     return blocks[np.isin(region_of_block, written)], written
 
 
-def read_regions(folder: Path | None, regions: Keys) -> tuple[Keys, list[Array]]:
-    """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums."""
+def read_regions(folder: Path | None, regions: Keys, num_radars: int) -> tuple[Keys, list[tuple[Array, ...]]]:
+    """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums, of each radar."""
     read = []
     for path in _region_paths(folder, regions):
         with reading(path, "a whole region of a live map"):
-            read.append(_sums_of(arrays_of(path, _CELL_COLUMNS)))
-    columns = [np.concatenate(parts) for parts in zip(*read, strict=True)]
-    keys, _, _, visibility_keys, _ = columns
-    return np.union1d(visibility_keys, keys >> BLOCK_BITS), columns
+            read.append(_sums_of(arrays_of(path, _columns_of(num_radars)), num_radars))
+    columns = [tuple(map(np.concatenate, zip(*parts, strict=True))) for parts in zip(*read, strict=True)]
+    each = [np.union1d(visibility_keys, keys >> BLOCK_BITS) for keys, _, _, visibility_keys, _ in columns]
+    return reduce(np.union1d, each), columns
 
 
 def unlink_regions(folder: Path | None, regions: Keys) -> None:
@@ -334,17 +334,26 @@ def unlink_regions(folder: Path | None, regions: Keys) -> None:
             path.unlink()
 
 
-def arrays_of_sums(sums: GrowingSums, blocks: Keys) -> dict[str, Array]:
+def _columns_of(num_radars: int) -> dict[str, tuple[Any, ...]]:
+    """Return the types of the columns of cells and blocks by name, radar by radar."""
+    suffixes = ["", *(f" of radar {k}" for k in range(1, num_radars))]
+    return {name + suffix: kind for suffix in suffixes for name, kind in _CELL_COLUMNS.items()}
+
+
+def arrays_of_sums(sums: RadarSums, blocks: Keys) -> dict[str, Array]:
     """Return the columns of cells and of these blocks (B,), by name."""
-    return dict(zip(_CELL_COLUMNS, (*sums.sums_of(blocks), *sums.visibility_of(blocks)), strict=True))
+    return dict(zip(_columns_of(len(sums)), chain(*sums.columns(blocks)), strict=True))
 
 
-def _sums_of(arrays: dict[str, Array]) -> tuple[Array, ...]:
-    """Return the columns of cells and blocks of a file. The core relies on ascending keys and non-empty cells."""
-    check_arrays(arrays, _CELL_COLUMNS)
-    descending = (arrays["keys"][1:] < arrays["keys"][:-1]).any()
-    check(not descending and (arrays["sums"][:, 0] >= 1).all(), "keys or counts are wrong")
-    return tuple(np.ascontiguousarray(arrays[name]) for name in _CELL_COLUMNS)
+def _sums_of(arrays: dict[str, Array], num_radars: int) -> list[tuple[Array, ...]]:
+    """Return the columns of cells and blocks of a file, of each radar. The core relies on ascending keys and non-empty cells."""
+    wanted, width = _columns_of(num_radars), len(_CELL_COLUMNS)
+    check_arrays(arrays, wanted)
+    columns = [np.ascontiguousarray(arrays[name]) for name in wanted]
+    found = [tuple(columns[first : first + width]) for first in range(0, len(columns), width)]
+    for keys, sums, *_ in found:
+        check(not (keys[1:] < keys[:-1]).any() and (sums[:, 0] >= 1).all(), "keys or counts are wrong")
+    return found
 
 
 _Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
@@ -356,10 +365,10 @@ class Described(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-    format: Literal[4] = 4
+    format: Literal[5] = 5
     config: dict[str, Any]
     origin: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
-    noise: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=3, max_length=3)]
+    noise: RigNoise | SensorNoise
     noise_of: _Count
     next_id: _Count
     with_intensities: bool | None
@@ -378,7 +387,7 @@ class Described(BaseModel):
         return None if self.mountings is None else checked_mountings(dict(self.mountings))
 
 
-def save_state(path: AnyPath, described: Described, scans: Iterable[LoggedScan], sums: GrowingSums) -> None:
+def save_state(path: AnyPath, described: Described, scans: Iterable[LoggedScan], sums: RadarSums) -> None:
     arrays = arrays_of_sums(sums, sums.block_keys())
     for i, scan in enumerate(scans):
         arrays |= {f"{name} {i}": array for name, array in scan.arrays.items()}
@@ -386,7 +395,7 @@ def save_state(path: AnyPath, described: Described, scans: Iterable[LoggedScan],
     write_arrays(path, arrays)
 
 
-def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array, ...]]:
+def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], list[tuple[Array, ...]]]:
     """Read a state written by :func:`save_state`, with the columns of its sums."""
     check_regular_file(path)
     with reading(path, "the state of a live map of this version, or it is damaged", KeyError, TypeError):
@@ -396,8 +405,9 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
         check(len(set(ids)) == len(ids), "ids are duplicated")
         check(described.origin is not None or not ids, "the origin is missing")
         names = [f"{name} {i}" for i in range(len(described.ids)) for name in _KINDS]
-        arrays = arrays_of(path, (*_CELL_COLUMNS, *names))
         scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
+        num_radars = max(len(radars), 1)
+        arrays = arrays_of(path, (*_columns_of(num_radars), *names))
         numbers = described.radars if radars else [0] * len(described.ids)
         each = zip(described.ids, described.poses, described.times_s, numbers, strict=True)
         for i, (scan_id, pose, time_s, k) in enumerate(each):
@@ -410,4 +420,4 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], tuple[Array,
             mounted = radars[k] if radars else None
             known: dict[str, Any] = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}
             scans.append(LoggedScan(check_pose(pose, "pose"), **held, **known))
-        return described, scans, _sums_of(arrays)
+        return described, scans, _sums_of(arrays, num_radars)

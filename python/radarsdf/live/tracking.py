@@ -12,7 +12,7 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.store import LoggedScan, ScanId, ScanLog, rig_of_scans
+from radarsdf.live.store import LoggedScan, ScanId, ScanLog
 from radarsdf.poses.agreement import CLEAR, ERRORS, sign_significance, turns_fast
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import (
@@ -387,7 +387,8 @@ class Follower:
 
 
 def _rig_of(steps: Sequence[Step]) -> Rig | None:
-    return rig_of_scans([step.logged for step in steps])
+    known = [step.logged.radar for step in steps if step.logged.radar is not None]
+    return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
 
 def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:

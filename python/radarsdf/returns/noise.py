@@ -98,6 +98,7 @@ class RigNoise(SensorNoise):
         of_each = zip(of_sensors, ranges_m, strict=True)
         weights = np.array([np.sum(mean.variances_m2(r) / own.variances_m2(r)) for own, r in of_each])
         weights *= counts.sum() / weights.sum() / np.maximum(counts, 1)
+        weights[counts == 0] = 1.0  # a radar of a live map that has not measured yet
         parts = np.maximum(np.rint(WEIGHT_UNIT * weights), 1).astype(int).tolist()
         return cls(mean.range_m, mean.azimuth_rad, mean.elevation_rad, tuple(of_sensors), tuple(parts))
 
