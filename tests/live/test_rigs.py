@@ -54,6 +54,18 @@ def test_scans_at_poses_of_the_body_are_those_of_a_fit(scans, tmp_path):
     np.testing.assert_allclose(*more, atol=0.05)
 
 
+def test_the_noise_of_radars_that_take_turns_is_that_of_each(scans, monkeypatch):
+    """Regression: every second scan was sampled, all of one radar."""
+    monkeypatch.setattr("radarsdf.live.state._NOISE_RETURNS", 6000)
+    rows = [[i for i, label in enumerate(scans.sensors) if label == own][:8] for own in ("front", "rear")]
+    live = LiveMap(FitConfig.quick(), T_body_sensor=scans.T_body_sensor)
+    for i in np.ravel(rows, order="F").tolist():
+        integrate(live, scans, i, scans.poses[i])
+    live.mesh()
+    front, rear, _ = live._state.noise.of_sensors
+    assert rear.range_m > 1.5 * front.range_m  # twice, by construction
+
+
 def test_the_body_is_tracked_by_all_radars(scans):
     live = LiveMap(T_body_sensor=scans.T_body_sensor)
     for i in range(30):
