@@ -10,7 +10,7 @@ from radarsdf import FitConfig, RefinedPoses
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.radar_map import checked_report
 from radarsdf.poses.agreement import Verdict
-from radarsdf.poses.loops import open_loops
+from radarsdf.poses.loops import open_loops, visits
 from radarsdf.poses.odometry import PosedScans
 from radarsdf.poses.planes import SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.rigid import aligned, turned_by
@@ -68,6 +68,16 @@ def test_the_returns_of_many_scans_measure_a_bias_in_yaw():
     hall = KINDS["hall"](seed=3)
     given = drifted(hall.poses, 0.02, 0.001, 2, yaw_rad=0.0035)
     assert radarsdf.refine_poses(hall.points, given).report["bias"][5] == pytest.approx(-0.0035, rel=0.1)
+
+
+def test_a_lap_that_ends_near_its_start_is_a_visit():
+    # For a range of 1 m, the first scan of the last part of the path is 0.54 m from the start, and the last scan 0.4 m.
+    lap = np.tile(np.eye(4), (100, 1, 1))
+    angle = np.linspace(0, 2 * np.pi, 100)
+    lap[:, :2, 3] = 9.45 / (2 * np.pi) * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    lap[:, 2, 3] = np.linspace(0, 0.4, 100)
+    ((later, earlier),) = visits(1.0, lap)
+    assert (later[-1], earlier[0]) == (99, 0)
 
 
 def test_an_open_loop_is_reported():

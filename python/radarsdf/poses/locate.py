@@ -101,8 +101,8 @@ def locate(
 
     Notes
     -----
-    A place is accepted if a submap of several scans agrees with the map better there than anywhere else, by a test of paired
-    differences and at odds of 1000 to 1. Along a tunnel or between equal buildings, no such place exists.
+    A place is accepted if the objects in a submap of several scans agree with the map there, at odds of 1000 to 1 to each other
+    place and to chance. Along a tunnel or between equal buildings, no such place exists.
 
     Examples
     --------

@@ -105,6 +105,7 @@ def visits(range_m: float, poses: Floats) -> Iterator[tuple[Ints, Ints]]:
     """Yield the scans of each later visit of a place, and those of earlier ones, given the median range."""
     path_m = np.append(0.0, lengths_of_steps_m(poses).cumsum())
     _, first, part = np.unique(np.floor(path_m / (_PART * range_m)), return_index=True, return_inverse=True)
+    first[-1] = len(poses) - 1  # where a lap meets its start
     pairs = cKDTree(poses[first, :3, 3]).query_pairs(_SAME_PLACE * range_m, output_type="ndarray")
     pairs = pairs[path_m[first[pairs[:, 1]]] - path_m[first[pairs[:, 0]]] > _AWAY * range_m]
     later = np.unique(pairs[:, 1])
