@@ -63,7 +63,7 @@ def test_a_map_after_random_operations_equals_one_of_its_scans():
     assert mesh_bits(live.mesh()) == mesh_bits(fresh.mesh())
     for i in list(inside):
         live.remove(i)
-    assert (live._state.sums.num_cells, live._state.sums.num_blocks, len(live)) == (0, 0, 0)
+    assert (live._state.sums.num_cells, len(live._state.sums.block_keys()), len(live)) == (0, 0, 0)
     assert len(live.mesh().faces) == 0
 
 
