@@ -9,10 +9,9 @@ import radarsdf
 from numpy.typing import NDArray
 from radarsdf import FitConfig, LiveMap
 from radarsdf.evaluation import holdout, surface_metrics
-from radarsdf.poses.rigid import aligned
+from radarsdf.simulate import measured_motion
 
 from bench.measure import timed
-from bench.paper.poses import walked
 from bench.runner import Row
 from scenes.scene import Scene, load_scene
 
@@ -20,9 +19,9 @@ _FINE_M = 0.1  # voxels of a fit; those of a live map are its leaf cells
 _HELD_OUT_EVERY = 5
 
 
-def _scenes(options: argparse.Namespace) -> Iterator[tuple[Scene, FitConfig]]:
+def _scenes(options: argparse.Namespace, few: int = 12) -> Iterator[tuple[Scene, FitConfig]]:
     for spec in options.cases:
-        scene = load_scene(spec, seed=options.seed, frames=12 if options.quick else None)
+        scene = load_scene(spec, seed=options.seed, frames=few if options.quick else None)
         yield scene, scene.config("default", num_threads=options.threads[0])
 
 
@@ -90,26 +89,32 @@ def intensities(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def loops(options: argparse.Namespace) -> Iterator[Row]:
-    """Yield a row per scene: a drifting drive, corrected by `refine_poses` and `move_all`, and a map with true poses."""
-    for scene, config in _scenes(options):
-        given = walked(scene.poses, 0.02, 0.1, options.seed)
+    """Yield a row per lap: a live map of tracked scans, before and after `close_loops`, and a map with true poses."""
+    for scene, config in _scenes(options, few=60):  # of fewer, neighbours are too far apart to be tracked
+        assert scene.simulation is not None
+        motion = measured_motion(scene.simulation, seed=options.seed)
+        live, true = LiveMap(config), LiveMap(config)
+        each = zip(scene.points, scene.poses, motion.doppler_mps, motion.times_s.tolist(), strict=True)
+        for points, pose, doppler_mps, time_s in each:
+            live.integrate(points, doppler_mps=doppler_mps, time_s=time_s)
+            true.integrate(points, pose)
 
-        def grown(poses: Any, scene: Scene = scene, config: FitConfig = config) -> LiveMap:
-            live = LiveMap(config)
-            for points, pose in zip(scene.points, poses, strict=True):
-                live.integrate(points, pose)
-            return live
+        def compared(live: LiveMap = live, scene: Scene = scene) -> tuple[float, float]:
+            T_true_live = scene.poses[0] @ np.linalg.inv(live.pose(live.scan_ids[0]))
+            end_m = (T_true_live @ live.pose(live.scan_ids[-1]) - scene.poses[-1])[:3, 3]
+            f_percent = _f_percent(live.mesh().apply_transform(T_true_live), scene, options)
+            return round(f_percent, 2), round(float(np.linalg.norm(end_m)), 3)
 
-        live = grown(aligned(given, scene.poses))
-        before = _f_percent(live.mesh(), scene, options)
-        refined = radarsdf.refine_poses(scene.points, given, config=config)
+        before = compared()
         with timed() as taken:
-            # Returns do not determine the global pose, which is not evaluated.
-            live.move_all(dict(zip(live.scan_ids, aligned(refined.poses, scene.poses), strict=True)))
+            live.close_loops()
+        after = compared()
         yield {
             "scene": scene.name,
-            "drifted, F %": round(before, 2),
-            "moved": round(_f_percent(live.mesh(), scene, options), 2),
-            "true poses": round(_f_percent(grown(scene.poses).mesh(), scene, options), 2),
-            "move_all, s": round(taken.cpu_s, 2),
+            "tracked, F %": before[0],
+            "closed": after[0],
+            "true poses": round(_f_percent(true.mesh(), scene, options), 2),
+            "end off, m": before[1],
+            "closed, m": after[1],
+            "close_loops, s": round(taken.cpu_s, 2),
         }

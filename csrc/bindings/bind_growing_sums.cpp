@@ -29,7 +29,6 @@ void bind_growing_sums(py::module_& m) {
       "Sums over scans in cells, and visibility counts of blocks of 8 x 8 x 8 cells, in a table that grows.")
       .def(py::init<>())
       .def_property_readonly("num_cells", &GrowingSums::num_cells)
-      .def_property_readonly("num_blocks", &GrowingSums::num_blocks)
       .def_property_readonly("num_bytes", &GrowingSums::num_bytes)
       .def(
           "apply",

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <vector>
 
 #include "util/large_array.hpp"
 
@@ -116,5 +117,22 @@ class FlatMap {
   int shift_ = 60;
   std::size_t size_ = 0;
 };
+
+// The value of a key in a vector with these free places. A missing key is inserted, with an empty value.
+template <typename T>
+T& value_at(FlatMap& places, std::vector<T>& values, std::vector<std::int32_t>& free, std::uint64_t key) {
+  std::int32_t place = places.find(key);
+  if (place < 0) {
+    if (free.empty()) {
+      free.push_back(static_cast<std::int32_t>(values.size()));
+      values.emplace_back();
+    }
+    place = free.back();
+    free.pop_back();
+    values[static_cast<std::size_t>(place)] = T{};
+    places.insert(key, place);
+  }
+  return values[static_cast<std::size_t>(place)];
+}
 
 }  // namespace radarsdf

@@ -4,9 +4,9 @@
 #include <array>
 #include <cstdint>
 #include <optional>
-#include <unordered_map>
 #include <vector>
 
+#include "lattice/flat_map.hpp"
 #include "poses/block_band.hpp"
 #include "returns/return_noise.hpp"
 
@@ -47,26 +47,26 @@ class LocalPlanes {
   static constexpr int kMoments = 10;  // 1, x, y, z, xx, xy, xz, yy, yz, zz, in quanta from the corner of the cell
   using Moments = std::array<std::int64_t, kMoments>;
   struct Plane {
-    bool flat = false;
     Vec3 centre, axes[3];  // the normal first
     double variances[3], count;
   };
   struct Residual {
     double value, variance;
-    const Plane* plane;
+    std::int32_t plane;
   };
 
   std::optional<std::uint64_t> key(const Vec3& point) const;
-  Moments moments(const Vec3& point, std::uint64_t key) const;
-  Plane plane_of(std::uint64_t key) const;
-  const Plane& plane(std::uint64_t key) const;
+  std::optional<Plane> plane_of(std::uint64_t key) const;  // if it is flat
   // direction: an array, as gcc 12 -O3 leaves out the rounding of a Vec3 to float and back.
   std::optional<Residual> residual(const Vec3& point, const float* direction, double range_m, const Vec3& up,
                                    const ReturnVariances& noise) const;
 
   double cell_size_m_;
-  std::unordered_map<std::uint64_t, Moments> cells_;
-  mutable std::unordered_map<std::uint64_t, Plane> planes_;  // cache, cleared when scans change
+  FlatMap cells_;  // rows of sums_
+  std::vector<Moments> sums_;
+  std::vector<std::int32_t> free_;  // rows of sums_ without a cell
+  mutable FlatMap known_;           // rows of planes_, a cache that is cleared when scans change
+  mutable std::vector<Plane> planes_;
 };
 
 }  // namespace radarsdf

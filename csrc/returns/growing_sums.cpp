@@ -21,19 +21,6 @@ std::uint64_t block_of(std::uint64_t leaf_key) { return leaf_key >> (3 * kVisibi
 std::size_t word_of(std::uint64_t leaf_key) { return (leaf_key & (kCellsOfBlock - 1)) >> 6; }
 std::uint64_t bit_of(std::uint64_t leaf_key) { return std::uint64_t{1} << (leaf_key & 63); }
 
-// Allocates an index in a vector; free indices are reused first.
-template <typename T>
-std::int32_t place_for(std::vector<T>& places, std::vector<std::int32_t>& free) {
-  if (free.empty()) {
-    places.emplace_back();
-    return static_cast<std::int32_t>(places.size() - 1);
-  }
-  const std::int32_t place = free.back();
-  free.pop_back();
-  places[static_cast<std::size_t>(place)] = T{};
-  return place;
-}
-
 // Reserves capacity with geometric growth, as push_back does: exact reserves would copy all elements each time.
 template <typename T>
 void make_room(std::vector<T>& places, std::size_t more) {
@@ -120,13 +107,8 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
     const std::uint64_t block_key = block_of(cell.key);
     changed.returns.push_back(block_key);
     Block& block = block_at(block_key);
-    std::int32_t place = number_of_cell_.find(cell.key);
-    if (place < 0) {
-      place = place_for(cells_, free_cells_);
-      number_of_cell_.insert(cell.key, place);
-      block.mask[word_of(cell.key)] |= bit_of(cell.key);
-    }
-    Cell& there = cells_[static_cast<std::size_t>(place)];
+    block.mask[word_of(cell.key)] |= bit_of(cell.key);
+    Cell& there = value_at(number_of_cell_, cells_, free_cells_, cell.key);
     for (int k = 0; k < kSums; ++k) {
       there.sums[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(there.sums[k]) +
                                                 static_cast<std::uint64_t>(cell.sums[k]));
@@ -204,9 +186,7 @@ void GrowingSums::insert(const SumsOfCells& cells, const VisibilityOfBlocks& vis
   reserve(static_cast<std::int64_t>(cells.keys.size()), blocks);
   for (std::size_t i = 0; i < cells.keys.size(); ++i) {
     const std::uint64_t key = cells.keys[i];
-    const std::int32_t place = place_for(cells_, free_cells_);
-    number_of_cell_.insert(key, place);
-    Cell& cell = cells_[static_cast<std::size_t>(place)];
+    Cell& cell = value_at(number_of_cell_, cells_, free_cells_, key);
     std::copy_n(cells.sums.data() + kSums * i, kSums, cell.sums);
     cell.scans = cells.scans[i];
     block_at(block_of(key)).mask[word_of(key)] |= bit_of(key);
@@ -240,12 +220,7 @@ void GrowingSums::for_each_cell(std::uint64_t block_key, const Block& block, con
 }
 
 GrowingSums::Block& GrowingSums::block_at(std::uint64_t key) {
-  std::int32_t place = number_of_block_.find(key);
-  if (place < 0) {
-    place = place_for(blocks_, free_blocks_);
-    number_of_block_.insert(key, place);
-  }
-  return blocks_[static_cast<std::size_t>(place)];
+  return value_at(number_of_block_, blocks_, free_blocks_, key);
 }
 
 void GrowingSums::drop_cell(std::uint64_t key, Block& block) {

@@ -73,7 +73,6 @@ class GrowingSums {
   ChangedBlocks apply(const SumsChange& change);
 
   std::int64_t num_cells() const { return static_cast<std::int64_t>(number_of_cell_.size()); }
-  std::int64_t num_blocks() const { return static_cast<std::int64_t>(number_of_block_.size()); }
   std::int64_t num_bytes() const;
 
   std::vector<std::uint64_t> block_keys() const;  // ascending

@@ -254,7 +254,7 @@ class _Localiser:
                 back = np.linalg.inv(own)
                 near = [scans[i] @ (back @ poses[i])[:3, :3].T + (back @ poses[i])[:3, 3] for i in part]
                 points, mean = thin(np.concatenate(near)), correction @ own
-                registered = planes.fit(points, mean, prior)
+                registered = planes.discount_chance(points, prior, planes.fit(points, mean, prior))
                 # Along the least certain axis, a step by chance is discounted as its information is.
                 axis, pose = least_certain(registered.covariance), registered.pose.copy()
                 pose[:3, 3] -= (1 - registered.observed[0]) * (axis @ (pose - mean)[:3, 3]) * axis

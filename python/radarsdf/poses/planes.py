@@ -1,10 +1,10 @@
 """Planes shared by scans at given poses, and registration of a scan with planes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import eigh
+from scipy.linalg import eigh, lapack
 from scipy.spatial import cKDTree
 
 from radarsdf._core import CellBlocks, CommonPlanes, LocalPlanes
@@ -254,37 +254,34 @@ class PlaneMap:
 
     def fit(self, scan: Floats, mean: Floats, prior: Floats, start: Floats | None = None) -> Tracked:
         """Fit the pose of a scan (N, 3), sensor frame, m, coarse to fine, given that of the prior and its covariance (6, 6)."""
-        prior = prior + _LEAST_VARIANCE * np.eye(6)
-        information, pose = np.linalg.inv(prior), mean if start is None else start
+        information = np.linalg.inv(prior + _LEAST_VARIANCE * np.eye(6))
+        pose = mean if start is None else start
         for planes, settled in zip((self.coarse, self.fine), _SETTLED, strict=True):
             for _ in range(_ITERATIONS):
                 *equations, inliers = planes.agreement(scan, pose, self.variances)
                 hessian, gradient = _discount_tilts(*equations)
                 total = hessian + information
                 off = gradient + information @ increments(mean, pose)
-                step = -np.linalg.solve(total, off).astype(np.float64)
+                step = -lapack.dgesv(total, off)[2]
                 pose = moved(pose, step)
                 if step @ total @ step < 6 * settled**2:
                     break
-        covariance = self._discount_chance(scan, pose, prior, np.linalg.inv(total))
-        moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
-        observed = moved_share, _removed_share(prior[3:, 3:], covariance[3:, 3:])
-        return Tracked(pose, covariance, inliers / len(scan), observed=observed)
+        return Tracked(pose, np.linalg.inv(total), inliers / len(scan))
 
-    def _discount_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
+    def discount_chance(self, scan: Floats, prior: Floats, found: Tracked) -> Tracked:
         """Remove the spurious information along the least certain axis that returns have for any shift of the scan."""
         # In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance: shifted scans have 0.6 to 1.2
         # times the information, those of nine other kinds of scenes 0.02 to 0.19 times.
-        cell_m = _CELLS[-1] * self.cell_size_m
+        prior, covariance = prior + _LEAST_VARIANCE * np.eye(6), found.covariance.copy()
         axis = least_certain(covariance)
         before, left = (float(axis @ each[:3, :3] @ axis) for each in (prior, covariance))
-        if before < (_SURE * cell_m) ** 2:
-            return covariance
-        chance = min(1.0, float(self._chance([scan], pose[None], axis).mean()))
-        widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
-        covariance = covariance.copy()
-        covariance[:3, :3] += max(widened, 0.0) * np.outer(axis, axis)
-        return covariance
+        if before >= (_SURE * _CELLS[-1] * self.cell_size_m) ** 2:
+            chance = min(1.0, float(self._chance([scan], found.pose[None], axis).mean()))
+            widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
+            covariance[:3, :3] += max(widened, 0.0) * np.outer(axis, axis)
+        moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
+        observed = moved_share, _removed_share(prior[3:, 3:], covariance[3:, 3:])
+        return replace(found, covariance=covariance, observed=observed)
 
     def information_by_chance(self, scans: Sequence[Floats], poses: Floats) -> tuple[Floats, float]:
         """Return the axis (3,) along which scans (N_i, 3) at `poses` (F, 4, 4) are least certain, and the share of their
@@ -317,12 +314,10 @@ def least_certain(covariance: Floats) -> Floats:
 def _discount_tilts(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
     """Return Hessian (6, 6) and gradient (6,) without the contribution (6, 6) of errors of the normals."""
     # Along a wall, slightly tilted normals would seem to observe the position along it.
-    try:
-        np.linalg.cholesky(hessian - doubt)
-    except np.linalg.LinAlgError:
+    if lapack.dpotrf(hessian - doubt)[1] != 0:  # not positive definite
         M = reduction(hessian, doubt)
         return M @ hessian @ M.T, M @ M @ gradient
-    return hessian - doubt, gradient - doubt @ np.linalg.solve(hessian, gradient)
+    return hessian - doubt, gradient - doubt @ lapack.dgesv(hessian, gradient)[2]
 
 
 def _removed_share(prior: Floats, covariance: Floats) -> float:

@@ -65,7 +65,8 @@ class Tracker:
         radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
         capture_m = self._planes.capture_m
         if predicted.spread_m(radius_m) <= capture_m:
-            return self._fit_pose(scan, predicted, predicted.turn.mean)
+            prior = self._prior(predicted, predicted.turn.mean)
+            return self._place(scan, prior, self._planes.fit(scan, *prior), predicted.turn.mean)
         spread_m = predicted.spread_m(0.0)
         if spread_m <= _MOST_RADII * radius_m:
             if (found := self._search_pose(scan, predicted, radius_m)) is not None:
@@ -105,13 +106,14 @@ class Tracker:
         covariance = covariance_in(predicted.covariance(), self.last.pose[:3, :3])
         return Tracked(pose, covariance, 0.0, self.last.segment, turn)
 
-    def _fit_pose(
-        self, scan: Floats, predicted: PredictedStep, turn: Floats, start: Floats | None = None
-    ) -> Tracked:
-        """Fit the pose, starting from `start`, with the prior of a sensor that turned by `turn`."""
-        last_R, mean = self.last.pose[:3, :3], self.last.pose @ predicted.pose(turn)
-        found = self._planes.fit(scan, mean, covariance_in(predicted.covariance(turn), last_R), start)
-        turn = rotation_vector(last_R.T @ found.pose[:3, :3], turn)
+    def _prior(self, predicted: PredictedStep, turn: Floats) -> tuple[Floats, Floats]:
+        """Return the mean pose of a sensor that turned by `turn`, and its covariance (6, 6)."""
+        last = self.last.pose
+        return last @ predicted.pose(turn), covariance_in(predicted.covariance(turn), last[:3, :3])
+
+    def _place(self, scan: Floats, prior: tuple[Floats, Floats], found: Tracked, turn: Floats) -> Tracked:
+        found = self._planes.discount_chance(scan, prior[1], found)
+        turn = rotation_vector(self.last.pose[:3, :3].T @ found.pose[:3, :3], turn)
         return replace(found, segment=self.last.segment, turn=turn)
 
     def _search_pose(self, scan: Floats, predicted: PredictedStep, radius_m: float) -> Tracked | None:
@@ -128,14 +130,15 @@ class Tracker:
         # In a self-similar scene, the best candidates may all lie near a wrong place.
         elsewhere = np.flatnonzero(apart_m(poses, poses[rows[0]], radius_m) > 2 * capture_m)
         rows = np.concatenate([rows, elsewhere[_best(means[elsewhere])]])
-        found = [self._fit_pose(scan, predicted, turns[i], poses[i]) for i in rows]
+        priors = [self._prior(predicted, turns[i]) for i in rows]
+        found = [self._planes.fit(scan, *priors[k], poses[i]) for k, i in enumerate(rows)]
         at = np.stack([one.pose for one in found])
         scores, by_chance = score(at), score(self._draw_unrelated(radius_m))
         first = int(np.argmax(scores.mean(axis=1)))
         rivals = scores[apart_m(at, at[first], radius_m) > capture_m]
         gains = scores[first] - np.concatenate([by_chance[_best(by_chance.mean(axis=1))], rivals])
         clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(sample))
-        return found[first] if clear.all() else None
+        return self._place(scan, priors[first], found[first], turns[rows[first]]) if clear.all() else None
 
     def _draw_unrelated(self, reach_m: float) -> Floats:
         """Draw upright poses (_UNRELATED, 4, 4) near those of the last scans, with other headings."""
