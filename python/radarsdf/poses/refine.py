@@ -103,7 +103,6 @@ class JointEstimator:
         if anchor is None:
             diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
-
         own = planes.equations[1].reshape(count, 6)
 
         def solve(gradient: Floats) -> Floats:
