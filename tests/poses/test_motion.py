@@ -61,6 +61,21 @@ def test_two_radars_that_measure_at_once_do_not_slow_the_steps_around():
     assert abs(motion.errors(poses)).max() < 1e-4
 
 
+def test_steps_with_little_information_reach_the_posterior_mean_in_few_rounds():
+    measured, information, change = np.sin(np.arange(41) / 6), 100.0, 0.1  # m and 1/m² of steps of 1 s; m²/s³
+    walk = np.diff(np.eye(41), axis=0)
+    expected = np.linalg.solve(information * np.eye(41) + walk.T @ walk / change**2, information * measured)
+    prior, steps_m = MotionPrior(np.full(3, 1e9), np.full(3, change**2), False), np.zeros(41)
+    for rounds in range(12):
+        poses = transform(np.zeros((42, 3)), np.outer(np.append(0.0, np.cumsum(steps_m)), [1.0, 0.0, 0.0]))
+        if rounds == 0:
+            motion = SteadyMotion.by((prior, prior), np.ones(2), np.arange(42.0), poses, np.zeros(6, bool))
+        motion = motion.updated(poses)
+        ahead = 1 / motion.shares[:, 0]
+        steps_m = (information * measured + ahead * motion.steps[:, 0, 3]) / (information + ahead)
+    assert abs(steps_m - expected).max() < 0.02 * abs(expected).max()
+
+
 @pytest.mark.parametrize("habits", [TURNS, MOVES], ids=["turns", "moves"])
 def test_a_rate_between_two_others_has_their_conditional_expectation(habits):
     durations_s = np.array([0.1, 0.3, 0.2, 0.5])

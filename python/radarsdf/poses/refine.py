@@ -34,11 +34,7 @@ _MOST_ROUNDS = 12  # maximum number of rounds with the cells of a map's surfels
 # Coarse planes are kept if fine ones double the standard deviation of a component of the steps, of few returns. By less, they do not
 # lose: surfaces are less flat in coarse cells, which no variance includes.
 _COARSER = np.log(4)
-# Convergence threshold on the step, standard deviations. Planes change in each round, so that 0.1 is often never reached;
-# 0.3 results in the same errors in half the time.
-_SETTLED = 0.3
 _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
-_EXACT = 1e-3  # tolerance for differences of solutions
 # Information of a weak prior on each pose, 1/m² and 1/rad²: unobserved components are not changed.
 WEAK = 1e-4
 _HELD_OUT = 0.2  # share of the returns for the test
@@ -81,6 +77,7 @@ class JointEstimator:
         doubled = (_FIRST_WINDOW << k for k in itertools.count())
         short = itertools.takewhile(lambda window: far and window < count, doubled)
         of_all = *_OF_ALL, *[1] * _MOST_ROUNDS
+        settled = min(motion.settled for motion in motions)
         plan = [*itertools.product(short, _OF_WINDOWS), *itertools.product([count], of_all)]
         bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
         for rounds, (window, planned) in enumerate(bar, 1):
@@ -98,7 +95,7 @@ class JointEstimator:
             before, poses = poses, moved(poses, steps)
             poses = aligned(poses, given) if anchor is None else poses
             motions = [motion.updated(poses, before, inverse, inverse_below) for motion in motions]
-            if window == count and cells == finest and decrement < _SETTLED**2 * steps.size:
+            if window == count and cells == finest and decrement < settled**2 * steps.size:
                 break
         assert noise is not None
         evidence = [motion.evidence() for motion in motions]
@@ -106,11 +103,12 @@ class JointEstimator:
         if anchor is None:
             diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
+        own = planes.equations[1].reshape(count, 6)
 
-        def solve(more: Floats | float) -> Floats:
-            """Solve for increments (F, 6) with `more` added to the gradient."""
-            right = gradient + more
-            return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
+        def solve(gradient: Floats) -> Floats:
+            """Solve for increments (F, 6) with this gradient (F, 6) alone."""
+            others = gradient - own
+            return planes.solve(diagonal, below, others, _TOLERANCE, _MOST_ITERATIONS, False, num_threads)[0]
 
         covariance = covariance + _by_biases(evidence, poses, solve)
         return PosesEstimate(poses, covariance, motions, noise, rounds)
@@ -159,13 +157,13 @@ def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> t
     return diagonal + WEAK * np.eye(6), below, gradient
 
 
-def _by_biases(motions: Sequence[Motion], poses: Floats, solve: Callable[[Floats | float], Floats]) -> Floats:
+def _by_biases(motions: Sequence[Motion], poses: Floats, solve: Callable[[Floats], Floats]) -> Floats:
     """Return the covariance (F, 6, 6) of the poses due to systematic errors of all steps, given the returns."""
     # The biases are unknowns, too: the poses are eliminated (Schur complement).
     by, own = (np.concatenate(parts) for parts in zip(*(m.by_bias(poses) for m in motions), strict=True))
     if len(by) == 0:
         return np.zeros((len(poses), 6, 6))
-    moved_by = np.stack([solve(each) for each in by]) - solve(0.0)
+    moved_by = np.stack([solve(each) for each in by])
     information = np.diag(own) + np.einsum("kfi,lfi->kl", by, moved_by)
     values, axes = np.linalg.eigh((information + information.T) / 2)
     root = np.einsum("kfi,kl->lfi", moved_by, axes / np.sqrt(1 + np.maximum(values, 0.0)))
