@@ -85,25 +85,22 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   };
 
   // Each group of rays has its own sums. These are integers, so results do not depend on the number of groups.
-  const auto num_rows = static_cast<std::size_t>(table.num_rows());
   const std::int64_t most = std::min<std::int64_t>(kMaxGroups, resolve_num_threads(num_threads));
   const std::int64_t num_groups = std::clamp<std::int64_t>(rays.count / kRaysOfGroup, 1, most);
-  std::vector<LargeVector<Sum>> groups(static_cast<std::size_t>(num_groups));
+  std::vector<LargeVector<Sum>> groups(num_groups);
   parallel_tasks(num_groups, num_threads, [&](std::int64_t g) {
-    LargeVector<Sum>& sums = groups[static_cast<std::size_t>(g)];
-    sums.resize(num_rows);
+    LargeVector<Sum>& sums = groups[g];
+    sums.resize(table.num_rows());
     NearbyRows leaf_rows(table.leaves());
     const std::int64_t end = rays.count * (g + 1) / num_groups;
     for (std::int64_t i = rays.count * g / num_groups; i < end; ++i) add_ray(i, leaf_rows, sums);
   });
-  parallel_blocks(table.num_rows(), 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (auto row = static_cast<std::size_t>(begin); row < static_cast<std::size_t>(end); ++row) {
-      Sum total;
-      for (const LargeVector<Sum>& sums : groups) total += sums[row];
-      const double weight = static_cast<double>(total.weight) * static_cast<double>(quanta);
-      distances_m[row] = total.weight > 0 ? static_cast<float>(static_cast<double>(total.distance) / weight) : 0;
-      sides[row] = total.side(rays.weight_of_return);
-    }
+  parallel_for(table.num_rows(), 1 << 14, num_threads, [&](std::int64_t row) {
+    Sum total;
+    for (const LargeVector<Sum>& sums : groups) total += sums[row];
+    const double weight = static_cast<double>(total.weight) * static_cast<double>(quanta);
+    distances_m[row] = total.weight > 0 ? static_cast<float>(static_cast<double>(total.distance) / weight) : 0;
+    sides[row] = total.side(rays.weight_of_return);
   });
 }
 

@@ -10,19 +10,14 @@
 namespace radarsdf {
 
 // Position of the lowest set bit; bits must not be 0.
-inline int lowest_bit(std::uint32_t bits) {
+inline int lowest_bit(std::uint64_t bits) {
 #ifdef _MSC_VER
   unsigned long position = 0;
-  _BitScanForward(&position, bits);
+  _BitScanForward64(&position, bits);
   return static_cast<int>(position);
 #else
-  return __builtin_ctz(bits);
+  return __builtin_ctzll(bits);
 #endif
-}
-
-inline int lowest_bit(std::uint64_t bits) {
-  const auto low = static_cast<std::uint32_t>(bits);
-  return low != 0 ? lowest_bit(low) : 32 + lowest_bit(static_cast<std::uint32_t>(bits >> 32));
 }
 
 // Sums pairs, then nibbles, then bytes: the x86-64 baseline has no instruction for it, and the library call is slower.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from radarsdf import checks
-from radarsdf.arrays import Array, Floats
+from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, positive, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
@@ -81,8 +81,7 @@ class Map(ABC):
             Derivatives along x, y and z of the world, pointing to free space. The norm is about 1 where rays met the surface at
             normal incidence, and larger at grazing incidence. NaN where :meth:`sdf` is.
         """
-        world, answer = as_positions(x)
-        return answer(self._evaluate(queries.plane, world, extrapolate=extrapolate)[:, 1:])
+        return self.sdf(x, return_gradient=True, extrapolate=extrapolate)[1]
 
     def observed(self, x: Any) -> Any:
         """Test whether positions `x` (N, 3) lie in or on the border of a leaf cell, near returns or in a small gap between them.
@@ -90,7 +89,7 @@ class Map(ABC):
         Where the result, (N,) bool, is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
         """
         world, answer = as_positions(x)
-        return answer(np.isfinite(self._evaluate(queries.zero, world, extrapolate=False)))
+        return answer(self._observed(world))
 
     def uncertainty(self, x: Any) -> Any:
         """Estimate the standard error of the surface's position, from the noise of the returns near positions `x` (N, 3).
@@ -440,6 +439,9 @@ class Map(ABC):
     @abstractmethod
     def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
         """Evaluate a query of :mod:`queries` where observed (`extrapolate`: at finite positions) and others finite; else NaN."""
+
+    @abstractmethod
+    def _observed(self, world: Floats) -> Bools: ...
 
     @abstractmethod
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":

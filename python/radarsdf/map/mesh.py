@@ -174,7 +174,7 @@ def sample_lattice(
     if voxel_size < leaf_size_m and not even:
         # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
         middles = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-        voxels = voxels[queries.occupied(contents, middles)]
+        voxels = voxels[queries.evaluate(contents.field.occupied, middles)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return corners, voxel_corners, distances_m, len(cells)
@@ -228,17 +228,15 @@ def _corner_distances(
     # A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
     # until it is in an occupied cell, and the distance moved is added to its absolute value.
     points = corners.astype(np.float32) * np.float32(voxel_size)
-    outside = ~queries.occupied(contents, points)
+    moved = np.flatnonzero(~queries.evaluate(contents.field.occupied, points))
     # Move each corner into its last voxel: NumPy keeps the last assignment of repeated indices.
     owners = np.zeros(len(corners), np.int32)
     owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
-    moved = np.flatnonzero(outside)
-    corner = points[moved]
     centres = (voxels[owners[moved]].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-    place, left = corner.copy(), np.arange(len(corner))
+    corner, place, left = points[moved], points[moved], np.arange(len(moved))
     for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
         place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
-        left = left[~queries.occupied(contents, place[left])]
+        left = left[~queries.evaluate(contents.field.occupied, place[left])]
     points[moved] = place
     values = queries.signed_distance(contents, points, description="mesh", progress=progress)
     values[moved] += np.copysign(np.linalg.norm(place - corner, axis=1), values[moved])

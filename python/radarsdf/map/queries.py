@@ -85,10 +85,6 @@ def to_local(contents: WholeMap, world: Floats) -> Floats32:
         return (world - contents.origin).astype(np.float32, order="C")
 
 
-def zero(_: MapContents, points: Floats32) -> Floats32:
-    return np.zeros(len(points), np.float32)
-
-
 def signed_distance(
     contents: MapContents, points: Floats32, *, description: str = "", progress: bool | None = False
 ) -> Floats32:
@@ -128,10 +124,6 @@ def intensity(
         return found.where(measured, torch.nan)
 
     return evaluate(of_chunk, np.concatenate([points, sensors], axis=1))
-
-
-def occupied(contents: MapContents, points: Floats32) -> Bools:
-    return evaluate(contents.field.occupied, points)
 
 
 @torch.inference_mode(mode=False)  # gradients, for normals, need ordinary tensors

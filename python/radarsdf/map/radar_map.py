@@ -14,7 +14,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 from typing_extensions import TypedDict
 
-from radarsdf.arrays import Array, Floats, Keys
+from radarsdf.arrays import Array, Bools, Floats, Keys
 from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, GridField, NeuralField
@@ -78,6 +78,9 @@ class RadarMap(Map):
         for x in rest:
             known = known & np.isfinite(x).all(axis=1)
         return queries.where(known, query, self._contents, points, *rest)
+
+    def _observed(self, world: Floats) -> Bools:
+        return queries.into_cells(self._contents, queries.to_local(self._contents, world))
 
     @property
     def contents_of_any(self) -> MapContents:

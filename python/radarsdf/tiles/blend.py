@@ -142,6 +142,11 @@ class TileBlend(Map):
             found[~seen] = _averages(rest, count, of_moved, columns)[~seen]
         return found if columns > 1 else found[:, 0]
 
+    def _observed(self, world: Floats) -> Bools:
+        seen = np.zeros(len(world), bool)
+        list(self._known_shares(world, seen))  # sets `seen`
+        return seen
+
     def evidence_at(self, world: Floats) -> EvidenceAt:
         """All tiles contribute, because evidence ends smoothly at each: a tile that observed no returns lowers it."""
 
