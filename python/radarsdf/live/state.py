@@ -25,7 +25,7 @@ from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sensor import Radars
-from radarsdf.returns.sums import ScanSums, lattice_of
+from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label, Rig
 from radarsdf.threads import resolve_num_threads
 
@@ -172,17 +172,15 @@ class GrowingState:
         bits = REGION_BITS - BLOCK_BITS
         in_region = np.arange(1 << int(bits), dtype=np.uint64)
         in_regions = (np.unique(blocks >> bits) << bits)[:, None] | in_region
-        sums = self.sums.weighted(in_regions.ravel(), self.config.leaf_size_m, self.noise)
+        sums = self.sums.weighted(self.config.leaf_size_m, self.noise, in_regions.ravel())
         surface.complete = False
         self._changed.clear()
-        return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
+        return surface, (blocks, sums, self.noise, self._num_threads), self.sums.visibility()
 
     def save(self, path: AnyPath) -> None:
         """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
         ids: list[Any] = [*self.log.ids, *self.log.sealed]
-        mountings: list[Any] | None = None
-        if self.mountings is not None:
-            mountings = [(label, T.tolist()) for label, T in self.mountings.items()]
+        mountings: Any = self.mountings and [(label, T.tolist()) for label, T in self.mountings.items()]
         savable = all(type(name) in (int, str) for name in [*ids, *(self.mountings or ())])
         check(savable, "a map can be saved only if ids of scans and labels are whole numbers or strings")
         scans = list(self.log.scans())
@@ -220,7 +218,8 @@ class GrowingState:
 
     def fit_input(self) -> Callable[[], FitInput]:
         """Return a function for the input of a fit of all scans, with the incremental sums, and an even sample of many rays."""
-        sums, visibility, origin = self._all_sums(self.noise), self._visibility(), self.origin
+        sums = self.sums.weighted(self.config.leaf_size_m, self.noise)
+        visibility, origin = self.sums.visibility(), self.origin
         every = 1 + int(sums.counts.sum()) // _FIT_RETURNS
         scans, is_part = self.scans(every), every > 1 or bool(self.log.sealed)
 
@@ -236,18 +235,12 @@ class GrowingState:
 
         return read
 
-    def _all_sums(self, noise: SensorNoise) -> ScanSums:
-        return self.sums.weighted(self.sums.block_keys(), self.config.leaf_size_m, noise)
-
-    def _visibility(self) -> VisibilityCounts:
-        return self.sums.visibility(self.sums.block_keys())
-
     def _settle_noise(self) -> None:
         """Estimate the sensor's noise if the number of scans has doubled or halved since the last time."""
         scans = len(self.log)
         if self._noise_of / 2 < scans < 2 * self._noise_of:
             return
-        sums = self._all_sums(_UNKNOWN)
+        sums = self.sums.weighted(self.config.leaf_size_m, _UNKNOWN)
         asked = list(self.log.scans(every=max(1, int(sums.counts.sum()) // _NOISE_RETURNS)))
         if asked:
             estimate = sensor_noise if self.mountings is None else rig_noise

@@ -322,7 +322,7 @@ def read_regions(folder: Path | None, regions: Keys, num_radars: int) -> tuple[K
     read = []
     for path in _region_paths(folder, regions):
         with reading(path, "a whole region of a live map"):
-            read.append(_sums_of(arrays_of(path, _columns_of(num_radars)), num_radars))
+            read.append(_read_sums(path, num_radars))
     columns = [tuple(map(np.concatenate, zip(*parts, strict=True))) for parts in zip(*read, strict=True)]
     each = [np.union1d(visibility_keys, keys >> BLOCK_BITS) for keys, _, _, visibility_keys, _ in columns]
     return reduce(np.union1d, each), columns
@@ -345,9 +345,10 @@ def arrays_of_sums(sums: RadarSums, blocks: Keys) -> dict[str, Array]:
     return dict(zip(_columns_of(len(sums)), chain(*sums.columns(blocks)), strict=True))
 
 
-def _sums_of(arrays: dict[str, Array], num_radars: int) -> list[tuple[Array, ...]]:
-    """Return the columns of cells and blocks of a file, of each radar. The core relies on ascending keys and non-empty cells."""
+def _read_sums(path: AnyPath, num_radars: int) -> list[tuple[Array, ...]]:
+    """Read the columns of cells and blocks of each radar. The core relies on ascending keys and non-empty cells."""
     wanted, width = _columns_of(num_radars), len(_CELL_COLUMNS)
+    arrays = arrays_of(path, wanted)
     check_arrays(arrays, wanted)
     columns = [np.ascontiguousarray(arrays[name]) for name in wanted]
     found = [tuple(columns[first : first + width]) for first in range(0, len(columns), width)]
@@ -406,8 +407,7 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], list[tuple[A
         check(described.origin is not None or not ids, "the origin is missing")
         names = [f"{name} {i}" for i in range(len(described.ids)) for name in _KINDS]
         scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
-        num_radars = max(len(radars), 1)
-        arrays = arrays_of(path, (*_columns_of(num_radars), *names))
+        arrays = arrays_of(path, names)
         numbers = described.radars if radars else [0] * len(described.ids)
         each = zip(described.ids, described.poses, described.times_s, numbers, strict=True)
         for i, (scan_id, pose, time_s, k) in enumerate(each):
@@ -420,4 +420,4 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], list[tuple[A
             mounted = radars[k] if radars else None
             known: dict[str, Any] = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}
             scans.append(LoggedScan(check_pose(pose, "pose"), **held, **known))
-        return described, scans, _sums_of(arrays, num_radars)
+        return described, scans, _read_sums(path, max(len(radars), 1))
