@@ -24,7 +24,9 @@ from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map import queries
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, dense_cells, evidence
 from radarsdf.map.map import Map, Query
+from radarsdf.map.mesh import extract_mesh
 from radarsdf.map.queries import MapContents
+from radarsdf.map.view import ViewedMap
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.reflectance import Reflectance
@@ -35,8 +37,6 @@ from radarsdf.settings import by_name, first_wrong
 
 if TYPE_CHECKING:
     import trimesh
-
-    from radarsdf.map.view import ViewedMap
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 14
@@ -84,8 +84,6 @@ class RadarMap(Map):
         return self._contents
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
-        from radarsdf.map.mesh import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
-
         return extract_mesh(self._contents, voxel_size, **wanted)
 
     def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
@@ -102,13 +100,11 @@ class RadarMap(Map):
     def view_statistics(self) -> ViewStatisticsAt:
         return self._contents.views_in_world()
 
-    def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":  # noqa: ARG002 - the whole map
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
         return self._viewed
 
     @cached_property
-    def _viewed(self) -> "ViewedMap":
-        from radarsdf.map.view import ViewedMap  # noqa: PLC0415 - trimesh is slow to import
-
+    def _viewed(self) -> ViewedMap:
         return ViewedMap.of(self._contents)
 
     def save(self, path: AnyPath) -> None:

@@ -4,12 +4,11 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
@@ -27,6 +26,9 @@ from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_memory, check_views
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import TilePlan, folder_of
+
+if TYPE_CHECKING:
+    import trimesh
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
@@ -132,7 +134,7 @@ def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]
     return together, own[merged]
 
 
-def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> trimesh.Trimesh:
+def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> "trimesh.Trimesh":
     paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     file_bytes = sum(path.stat().st_size for path in paths)
     count, most = file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes
@@ -195,6 +197,8 @@ def _write_tileset(
     GLB files hold float32 relative to the origin of the tile, which is float64 in the JSON: precision does not depend on the
     distance from the world's origin. Components that reach a border are kept.
     """
+    import trimesh  # noqa: PLC0415 - slow
+
     folder = path.with_suffix("")
     check_outputs([path])
     folder.mkdir(exist_ok=True)
