@@ -14,8 +14,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from radarsdf import checks
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Keys
-from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, check_values_of_scan, positions
+from radarsdf.checks import AnyPath, check, restating
 from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.sums import RadarSums
@@ -138,12 +139,8 @@ class _Rows:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        try:
-            with self._opened:
-                yield self._opened
-        except sqlite3.Error as error:
-            msg = f"{self._path}: {error}"
-            raise OSError(msg) from error
+        with restating(str(self._path), sqlite3.Error, kind=OSError), self._opened:
+            yield self._opened
 
 
 class ScanLog:
@@ -357,7 +354,7 @@ def _read_sums(path: AnyPath, num_radars: int) -> list[tuple[Array, ...]]:
     return found
 
 
-_Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+_Coordinate = Annotated[float, Field(ge=-checks.MAX_POSITION_M, le=checks.MAX_POSITION_M)]
 _Count = Annotated[int, Field(ge=0, le=2**62)]
 
 
@@ -412,12 +409,12 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], list[tuple[A
         each = zip(described.ids, described.poses, described.times_s, numbers, strict=True)
         for i, (scan_id, pose, time_s, k) in enumerate(each):
             held: dict[str, Any] = {name: arrays[key] for name in _KINDS if (key := f"{name} {i}") in arrays}
-            points = positions(held["points"], "points")
+            points = checks.positions(held["points"], "points")
             for name, array in held.items():
                 if name != "points":
-                    check_values_of_scan(array, points, name, 0)
+                    checks.check_values_of_scan(array, points, name, 0)
                 check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
             mounted = radars[k] if radars else None
             known: dict[str, Any] = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}
-            scans.append(LoggedScan(check_pose(pose, "pose"), **held, **known))
+            scans.append(LoggedScan(checks.check_pose(pose, "pose"), **held, **known))
         return described, scans, _read_sums(path, max(len(radars), 1))

@@ -15,7 +15,7 @@ import numpy as np
 
 from radarsdf._core import cell_keys
 from radarsdf.arrays import Bools, Floats, Ints
-from radarsdf.checks import are_rigid, check, one_for_each_scan
+from radarsdf.checks import are_rigid, check, one_for_each_scan, restating
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
@@ -153,12 +153,10 @@ class _Planner:
     def _rays(self, scans: list[Scan], first: int) -> Rays:
         """Prepare the static returns, checked, in a frame of their own."""
         held = scans_in_memory(scans)
-        try:
+        where = f"of the {len(scans)} scans from number {first} on, numbered from 0"
+        with restating(where, ValueError, TypeError):
             given = held.points, held.poses, held.intensities, held.doppler_mps, held.rig
             return static_rays(*given, self._config, whole=False)[0]
-        except (ValueError, TypeError) as error:
-            msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
-            raise ValueError(msg) from error
 
     def plan(self, input_digest: str) -> Plan:
         check(self._axes, "there are no scans")
