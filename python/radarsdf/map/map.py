@@ -229,7 +229,7 @@ class Map(ABC):
             check(is_position, f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m")
         limits = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
         limits["min_component_triangles"] = min_component_triangles
-        mesh: Any = self._surface_mesh(voxel_size, box=box, progress=progress, **limits)
+        mesh = self._surface_mesh(voxel_size, box=box, progress=progress, **limits)
         if viewpoint is None or scale is None:
             return mesh
         values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position).astype(np.float32)
@@ -437,7 +437,7 @@ class Map(ABC):
         """Evaluate a query of :mod:`queries` where observed (`extrapolate`: at finite positions) and others finite; else NaN."""
 
     @abstractmethod
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> Any:
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     @abstractmethod

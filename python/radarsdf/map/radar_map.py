@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,9 +34,6 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
 from radarsdf.returns.view_statistics import FreeSpace, ViewStatistics, ViewStatisticsAt
 from radarsdf.settings import by_name, first_wrong
-
-if TYPE_CHECKING:
-    import trimesh
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 14
@@ -83,7 +80,7 @@ class RadarMap(Map):
     def contents_of_any(self) -> MapContents:
         return self._contents
 
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> Any:
         return extract_mesh(self._contents, voxel_size, **wanted)
 
     def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:

@@ -280,7 +280,8 @@ class Reflectance:
         plane = surfels.flat_planes_at(points, num_threads)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)
-        groups = _groups(points, directions, incidence, kind)
+        few = len(points) <= _MOST_RETURNS  # of few returns, each is its own group
+        groups = np.arange(len(points)) if few else cell_rows(kind, points, directions, incidence)[0]
         places = _means(points, groups), _means(directions, groups)
         times, share = 1.0, 0.0
         if ask is not None:
@@ -342,13 +343,6 @@ def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats
     angle: Floats32 = np.arccos(np.minimum(cosine, np.float32(1)))
     angle[plane < 0] = np.nan
     return angle
-
-
-def _groups(points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> Ints | Ints32:
-    """Group returns by place and view: return the row (N,) of each one's group. With few returns, each is its own."""
-    if len(points) <= _MOST_RETURNS:
-        return np.arange(len(points))
-    return cell_rows(kind, points, directions, incidence_rad)[0]
 
 
 def _means(values: Floats32, groups: Ints | Ints32) -> Floats32:

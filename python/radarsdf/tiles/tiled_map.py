@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.mesh import export_mesh, mesh_of, parts_of, viewed_tiles
 from radarsdf.tiles.plan import TilePlan, map_path, report_of
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 class TiledMap(TileBlend):
@@ -55,7 +52,7 @@ class TiledMap(TileBlend):
     def __reduce__(self) -> "tuple[Callable[..., TiledMap], tuple[Any, ...]]":
         return partial(TiledMap, memory_bytes=self.memory_bytes), (str(self.folder),)
 
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> Any:
         return mesh_of(self, voxel_size, **wanted)
 
     def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
