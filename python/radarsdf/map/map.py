@@ -437,7 +437,7 @@ class Map(ABC):
         """Evaluate a query of :mod:`queries` where observed (`extrapolate`: at finite positions) and others finite; else NaN."""
 
     @abstractmethod
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> Any:
+    def _surface_mesh(self, voxel_size: float, *, box: Any, progress: bool | None, **wanted: Any) -> Any:
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     @abstractmethod

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from radarsdf._core import marching_cubes_sparse, mesh_components, vertex_areas
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
-from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
@@ -95,18 +95,6 @@ class Surface:
         mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m.take(rows)
         mesh.metadata |= metadata
         return mesh
-
-
-def extract_mesh(
-    contents: MapContents, voxel_size: float, *, box: ArrayLike | None, progress: bool | None, **wanted: Any
-) -> "trimesh.Trimesh":
-    """Extract the mesh of one map. `wanted`: the limits of :meth:`Map.mesh`."""
-    voxel_size = positive(voxel_size, "voxel_size")
-    check(voxel_size <= MAX_POSITION_M, f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}")
-    limits = Limits.of(voxel_size, **wanted)
-    local_box = None if box is None else check_box(box) - contents.origin
-    surface = Surface.of(contents, voxel_size, local_box, progress)
-    return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
 
 
 def with_all(good: Bools, faces: Ints32) -> Bools:

@@ -15,7 +15,7 @@ from torch import Tensor
 from typing_extensions import TypedDict
 
 from radarsdf.arrays import Array, Floats, Keys
-from radarsdf.checks import AnyPath, check
+from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, GridField, NeuralField
 from radarsdf.io.files import check_regular_file, reading, write_whole
@@ -24,8 +24,9 @@ from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map import queries
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, dense_cells, evidence
 from radarsdf.map.map import Map, Query
-from radarsdf.map.mesh import extract_mesh
+from radarsdf.map.mesh import Surface
 from radarsdf.map.queries import MapContents
+from radarsdf.map.threshold import Limits
 from radarsdf.map.view import ViewedMap
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.intensities import IntensityScale
@@ -80,8 +81,13 @@ class RadarMap(Map):
     def contents_of_any(self) -> MapContents:
         return self._contents
 
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> Any:
-        return extract_mesh(self._contents, voxel_size, **wanted)
+    def _surface_mesh(self, voxel_size: float, *, box: Any, progress: bool | None, **wanted: Any) -> Any:
+        voxel_m = positive(voxel_size, "voxel_size")
+        check(voxel_m <= MAX_POSITION_M, f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_m}")
+        limits = Limits.of(voxel_m, **wanted)
+        local_box = None if box is None else check_box(box) - self.origin
+        surface = Surface.of(self._contents, voxel_m, local_box, progress)
+        return surface.mesh(self.origin, limits, self.num_cells)
 
     def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         leaf_m = self.config.leaf_size_m

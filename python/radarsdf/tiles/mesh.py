@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from radarsdf._core import marching_cubes_sparse
 from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
-from radarsdf.checks import AnyPath, check, check_box, hides_bar, path_of, positive
-from radarsdf.io.files import check_outputs, checked_suffix, reading, write_whole
-from radarsdf.io.meshes import MATT, MESH_SUFFIXES, T_GLTF_WORLD, encode_glb, write_mesh
+from radarsdf.checks import check, check_box, hides_bar, positive
+from radarsdf.io.files import check_outputs, reading, write_whole
+from radarsdf.io.meshes import MATT, T_GLTF_WORLD, encode_glb
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import sparse_lattice
@@ -148,22 +148,7 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted:
     return whole.mesh(np.zeros(3), limits, leaf_cells)
 
 
-def export_mesh(
-    city: TileBlend, path: AnyPath, voxel_size: float, progress: bool | None, **limits: Any
-) -> tuple[int, int]:
-    """See :meth:`TiledMap.export`. Unwritable paths are detected before the work."""
-    if path_of(path, "path").suffix.lower() == ".json":
-        return _write_tileset(city, Path(path), voxel_size, progress, **limits)
-    checked_suffix(path, MESH_SUFFIXES, "meshes")
-    check_outputs([path])
-    mesh = mesh_of(city, voxel_size, progress, **limits)
-    check(len(mesh.faces) != 0, f"{city.folder} has no surface here: nothing written")
-    write_mesh(path, mesh)
-    return len(mesh.vertices), len(mesh.faces)
-
-
 def viewed_tiles(city: TileBlend, tiles: list[TilePlan]) -> ViewedMap:
-    """Arguments of views of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(tiles[0].origin_cells)
@@ -189,7 +174,7 @@ _ERROR_OF_EDGE = 1 / 16
 _GREY = MATT["pbrMetallicRoughness"] | {"baseColorFactor": [0.784, 0.784, 0.784, 1.0]}
 
 
-def _write_tileset(
+def write_tileset(
     city: TileBlend, path: Path, voxel_size: float, progress: bool | None, **wanted: Any
 ) -> tuple[int, int]:
     """Write ``NAME.json`` and in a folder ``NAME`` a GLB file per tile with triangles.

@@ -3,12 +3,15 @@
 import shutil
 from collections.abc import Callable
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import AnyPath, path_of
+from radarsdf.checks import AnyPath, check, path_of
+from radarsdf.io.files import check_outputs, checked_suffix
+from radarsdf.io.meshes import MESH_SUFFIXES, write_mesh
 from radarsdf.map.confidence import CellsInBox, dense_cells
 from radarsdf.map.map import Map
 from radarsdf.map.radar_map import RadarMap, load_contents
@@ -17,7 +20,7 @@ from radarsdf.map.view import ViewedMap
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
-from radarsdf.tiles.mesh import export_mesh, mesh_of, parts_of, viewed_tiles
+from radarsdf.tiles.mesh import mesh_of, parts_of, viewed_tiles, write_tileset
 from radarsdf.tiles.plan import TilePlan, map_path, report_of
 
 
@@ -115,7 +118,14 @@ class TiledMap(TileBlend):
         ValueError, MemoryError, OSError
             As for :meth:`mesh`, or if the suffix is unknown, there is no surface, or a file cannot be written.
         """
-        return export_mesh(self, path, voxel_size, progress, **limits)
+        if path_of(path, "path").suffix.lower() == ".json":
+            return write_tileset(self, Path(path), voxel_size, progress, **limits)
+        checked_suffix(path, MESH_SUFFIXES, "meshes")
+        check_outputs([path])  # before the work
+        mesh = mesh_of(self, voxel_size, progress, **limits)
+        check(len(mesh.faces) != 0, f"{self.folder} has no surface here: nothing written")
+        write_mesh(path, mesh)
+        return len(mesh.vertices), len(mesh.faces)
 
     def threshold(
         self, voxel_size: float = VOXEL_M, *, progress: bool | None = None, **limits: Any
