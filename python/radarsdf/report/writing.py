@@ -151,7 +151,6 @@ def write_changes_report(
 
 
 def surface_values(subject: Subject) -> dict[str, Any]:
-    """Values of the surface section."""
     mesh, _ = subject.shown
     colors, legend = _colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
     origin = subject.radar_map.origin
@@ -172,7 +171,6 @@ def error_values(subject: Subject) -> dict[str, Any] | None:
 
 
 def uncertainty_values(subject: Subject) -> dict[str, Any]:
-    """Values of the uncertainty section."""
     mesh, (shown, _) = subject.mesh, subject.shown
     sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
     shown_m, percentiles = shown.vertex_attributes["uncertainty_m"], [10, 50, 90]

@@ -72,7 +72,11 @@ def fit_response(values: Floats32, views: Views) -> tuple[Floats, Floats32]:
     coefficients[:, :_BASE] = regression(rays, y)
     left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
     table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
-    table[~_near(_bins(_log_range(ranges_m), directions[:, 2]))] += _UNMEASURED
+    bins = _bins(_log_range(ranges_m), directions[:, 2])
+    returns = np.bincount(bins, minlength=table.size).reshape(TABLE_SHAPE)
+    # Within a standard deviation of the widest kernels from a return.
+    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
+    table[product(product(by_range, returns), by_elevation) <= 0] += _UNMEASURED
     for kind in (LEVEL, STEEP):
         own = chosen == kind
         if np.count_nonzero(own) >= _FEWEST:
@@ -84,7 +88,6 @@ def fit_response(values: Floats32, views: Views) -> tuple[Floats, Floats32]:
 
 @np.errstate(under="ignore")
 def response(coefficients: Floats, table: Floats32, views: Views) -> Floats32:
-    """Predict values (N,) for views."""
     directions, ranges_m, incidence_rad, kinds = views
     of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
     by_angle = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in coefficients]
@@ -184,13 +187,6 @@ def _smooth_means(bins: Ints32, values: Floats) -> Floats:
             smooth_sums, smooth_masses = (product(product(by_range, t), by_elevation) for t in tables)
             means = (smooth_sums + _TABLE_SHRINKAGE * means) / (smooth_masses + _TABLE_SHRINKAGE)
     return means
-
-
-def _near(bins: Ints32) -> Bools:
-    """Return a mask of the table: entries within a standard deviation of the widest kernels from a return."""
-    returns = np.bincount(bins, minlength=TABLE_SHAPE[0] * TABLE_SHAPE[1]).reshape(TABLE_SHAPE)
-    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
-    return product(product(by_range, returns), by_elevation) > 0
 
 
 def _kernels(widths: tuple[float, float]) -> list[Floats]:

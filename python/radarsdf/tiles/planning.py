@@ -87,8 +87,6 @@ def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
 
 
 class _Returns:
-    """Returns of a radar, as far as its model needs them."""
-
     def __init__(self) -> None:
         self.samples: list[tuple[int, Scan]] = []  # scans with the smallest hashes
         self.intensities = Intensities()
@@ -236,7 +234,11 @@ class _Planner:
         noise = SensorNoise.median([of_tile.mean for of_tile in noises])
         of_rigs = (rig.of_sensors for rig in noises if isinstance(rig, RigNoise))
         own_noise = [*map(SensorNoise.median, zip(*of_rigs, strict=True))] or [noise]
-        radars, same_unit = [], _median_units(units)
+        # Medians of the tiles in which the units are relative to the first radar.
+        alike = [of_tile for of_tile in units if of_tile[0] == SAME_UNIT] or units[:1]
+        each = ([unit for unit in of_radar if unit is not None] for of_radar in zip(*alike, strict=True))
+        same_unit: list[Unit] = [tuple(np.median(own or [SAME_UNIT], axis=0).tolist()) for own in each]
+        radars = []
         for radar, own, unit in zip(plan.radars, own_noise, same_unit, strict=True):
             model = dataclasses.replace(radar.sensor, noise=own, unit=unit)
             radars.append(dataclasses.replace(radar, sensor=model))
@@ -258,13 +260,6 @@ class _Planner:
         values = [in_map_unit(*own) for own in measured]
         limits = {name: getattr(self._config.returns, name) for name in ("min_range_m", "max_range_m")}
         return Sensor.of([scan.points for scan, _ in scans], values or None, **limits)
-
-
-def _median_units(of_tiles: list[tuple[Unit | None, ...]]) -> list[Unit]:
-    """Medians of the units of each radar, of the tiles in which they are relative to the first radar; `SAME_UNIT` without any."""
-    alike = [units for units in of_tiles if units[0] == SAME_UNIT] or of_tiles[:1]
-    each = ([unit for unit in of_radar if unit is not None] for of_radar in zip(*alike, strict=True))
-    return [tuple(np.median(units or [SAME_UNIT], axis=0).tolist()) for units in each]
 
 
 def rays_path(folder: Path, tile: Tile) -> Path:
