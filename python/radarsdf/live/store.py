@@ -299,7 +299,7 @@ def _pose_of(blob: bytes) -> Floats:
     return np.frombuffer(blob).reshape(4, 4).copy()
 
 
-def _region_paths(folder: Path | None, regions: Keys) -> list[Path]:
+def region_paths(folder: Path | None, regions: Keys) -> list[Path]:
     """Return the files of regions (R,), which hold their sums bit-identically."""
     return [(folder or Path()) / f"region-{region:016x}.npz" for region in regions.tolist()]
 
@@ -309,7 +309,7 @@ def write_regions(folder: Path | None, sums: RadarSums, regions: Keys) -> tuple[
     blocks = sums.block_keys()
     region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
     written = np.intersect1d(regions, region_of_block)
-    for region, path in zip(written, _region_paths(folder, written), strict=True):
+    for region, path in zip(written, region_paths(folder, written), strict=True):
         _save(path, **arrays_of_sums(sums, blocks[region_of_block == region]))
     return blocks[np.isin(region_of_block, written)], written
 
@@ -317,18 +317,12 @@ def write_regions(folder: Path | None, sums: RadarSums, regions: Keys) -> tuple[
 def read_regions(folder: Path | None, regions: Keys, num_radars: int) -> tuple[Keys, list[tuple[Array, ...]]]:
     """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums, of each radar."""
     read = []
-    for path in _region_paths(folder, regions):
+    for path in region_paths(folder, regions):
         with reading(path, "a whole region of a live map"):
             read.append(_read_sums(path, num_radars))
     columns = [tuple(map(np.concatenate, zip(*parts, strict=True))) for parts in zip(*read, strict=True)]
     each = [np.union1d(visibility_keys, keys >> BLOCK_BITS) for keys, _, _, visibility_keys, _ in columns]
     return reduce(np.union1d, each), columns
-
-
-def unlink_regions(folder: Path | None, regions: Keys) -> None:
-    for path in _region_paths(folder, regions):
-        with suppress(OSError):  # a leftover file is harmless
-            path.unlink()
 
 
 def _columns_of(num_radars: int) -> dict[str, tuple[Any, ...]]:
