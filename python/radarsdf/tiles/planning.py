@@ -61,16 +61,6 @@ def checked_scans(scans: Iterable[Any], digest: hashlib.blake2b) -> Iterator[Sca
         _LOG.warning(note)
 
 
-def make_plan(
-    scans: Iterable[Scan], digest: hashlib.blake2b, folder: Path, config: FitConfig, grid: TileGrid
-) -> Plan:
-    """Read scans once, write the rays of each tile, and return the plan. `digest`: of the scans, after they are read."""
-    planner = _Planner(folder, config, grid)
-    for chunk in _chunks(scans, config.returns.accumulate_scans):
-        planner.add(chunk)
-    return planner.plan(digest.hexdigest())
-
-
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
     """Yield lists of consecutive scans that keep the groups to accumulate whole."""
     chunk: list[Scan] = []
@@ -96,7 +86,7 @@ class _Returns:
         self.samples = sorted(self.samples, key=itemgetter(0))[:_SENSOR_SCANS]
 
 
-class _Planner:
+class Planner:
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
         self._folder, self._config, self._grid = folder, config, grid
         self._origins: dict[Tile, Ints] = {}  # (3,) origins of the tiles' maps, leaf cells
@@ -105,7 +95,7 @@ class _Planner:
         self._radars: dict[Label, _Returns] = {}
         self._with_intensities: bool | None = None
 
-    def add(self, scans: list[Scan]) -> None:
+    def _add(self, scans: list[Scan]) -> None:
         first = sum(map(len, self._axes))
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
@@ -156,7 +146,10 @@ class _Planner:
             given = held.points, held.poses, held.intensities, held.doppler_mps, held.rig
             return static_rays(*given, self._config, whole=False)[0]
 
-    def plan(self, input_digest: str) -> Plan:
+    def plan(self, scans: Iterable[Scan], digest: hashlib.blake2b) -> Plan:
+        """Read scans once, write the rays of each tile, and return the plan. `digest`: of the scans, after they are read."""
+        for chunk in _chunks(scans, self._config.returns.accumulate_scans):
+            self._add(chunk)
         check(self._axes, "there are no scans")
         tiles = []
         for tile, (returns, rays) in sorted(self._counts.items()):
@@ -185,7 +178,7 @@ class _Planner:
             sensor=radars[0].sensor,
             radars=tuple(radars),
             scans=len(axes),
-            input_digest=input_digest,
+            input_digest=digest.hexdigest(),
             tiles=tuple(tiles),
         )
         plan = self._completed(draft)
