@@ -58,16 +58,12 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:
     Raises a TypeError for anything but real numbers, and a ValueError for masked values and integers too large for float64.
     """
     refuse_masked(values, name)
-    try:
+    must = f"{name} must be real numbers, and all rows equally long"
+    kinds = TypeError, ValueError, RuntimeError  # the last of a tensor that requires a gradient
+    with restating(name, OverflowError), restating(must, *kinds, kind=TypeError):
         array = np.asarray(values)
         if array.dtype.kind == "O":  # numbers of other types, or integers with many digits
             array = array.astype(np.float64)
-    except OverflowError as error:
-        msg = f"{name}: {error}"
-        raise ValueError(msg) from error
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that requires a gradient
-        msg = f"{name} must be real numbers, and all rows equally long: {error}"
-        raise TypeError(msg) from error
     if array.dtype.kind not in "biuf":
         raise _wrong_type(name, "real numbers", array.dtype)
     with np.errstate(over="ignore"):  # overflow becomes infinite, which callers refuse
