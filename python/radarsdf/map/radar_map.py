@@ -218,9 +218,8 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     check((evidence["information"] >= 0).all(), "information is negative")
     free_space = FreeSpace(**_taken(tensors, _PARTS["free_space"], "free_space."))
     free_space.check()
-    sigma = float(description["view_sigma"])
     views = _taken(tensors, _PARTS["view_statistics"], "view_statistics.")
-    view_statistics = ViewStatistics(**views, sigma=sigma)
+    view_statistics = ViewStatistics(**views, sigma=float(description["view_sigma"]))
     view_statistics.check(config.leaf_size_m)
     limits = description["intensity_scale"]
     scale = None if limits is None else IntensityScale.between(limits)

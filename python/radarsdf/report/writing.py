@@ -113,7 +113,6 @@ def require_extras() -> None:
 
 def write_report(path: AnyPath, subject: Subject) -> int:
     """Write a self-contained HTML page about a map atomically, and return its size, bytes. Needs matplotlib and viser."""
-    require_extras()
     report = subject.radar_map.report
     settings, defaults = (flat_settings(of.to_dict()) for of in (subject.radar_map.config, FitConfig()))
     of_surface = {"surface": surface_values, "errors": error_values, "uncertainty": uncertainty_values}
@@ -140,7 +139,6 @@ def write_changes_report(
     `names`: of the earlier and the later map. `edge_m`: vertex spacing of their surfaces. `regions`: the changes to
     list, largest first. Raises an ImportError if matplotlib or viser is missing, an OSError if the file cannot be written.
     """
-    require_extras()
     mesh: Any = thinned(changes.mesh(), MAX_VERTICES, edge_m)[0]
     surface = None
     if len(mesh.faces):
