@@ -3,7 +3,8 @@
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -23,6 +24,7 @@ MISSING_POSES = (
 )
 
 AnyPath: TypeAlias = str | os.PathLike[str]
+_Error: TypeAlias = type[Exception]
 
 _Kind = TypeVar("_Kind")
 
@@ -30,10 +32,24 @@ _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; sc
 _RIGID = f"rotation, translation within {MAX_POSITION_M:g} m, last row 0 0 0 1"
 
 
-def check(holds: object, message: str, error: type[Exception] = ValueError) -> None:
+def check(holds: object, message: str, error: _Error = ValueError) -> None:
     """Raise an `error` with this message unless `holds`."""
     if not holds:
         raise error(message)
+
+
+@contextmanager
+def restating(
+    message: str, *errors: _Error, kind: _Error = ValueError, unless: _Error | tuple[()] = ()
+) -> Iterator[None]:
+    """Turn `errors` raised in the block, `unless` they are of that type, into a `kind` with this message before theirs."""
+    try:
+        yield
+    except unless:
+        raise
+    except errors as error:
+        msg = f"{message}: {error}"
+        raise kind(msg) from error
 
 
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:
@@ -42,16 +58,12 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:
     Raises a TypeError for anything but real numbers, and a ValueError for masked values and integers too large for float64.
     """
     refuse_masked(values, name)
-    try:
+    must = f"{name} must be real numbers, and all rows equally long"
+    kinds = TypeError, ValueError, RuntimeError  # the last of a tensor that requires a gradient
+    with restating(name, OverflowError), restating(must, *kinds, kind=TypeError):
         array = np.asarray(values)
         if array.dtype.kind == "O":  # numbers of other types, or integers with many digits
             array = array.astype(np.float64)
-    except OverflowError as error:
-        msg = f"{name}: {error}"
-        raise ValueError(msg) from error
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that requires a gradient
-        msg = f"{name} must be real numbers, and all rows equally long: {error}"
-        raise TypeError(msg) from error
     if array.dtype.kind not in "biuf":
         raise _wrong_type(name, "real numbers", array.dtype)
     with np.errstate(over="ignore"):  # overflow becomes infinite, which callers refuse

@@ -109,10 +109,6 @@ class Rig:
         """Return T_world_sensor (F, 4, 4) of the scans from their `poses` (F, 4, 4), m."""
         return np.einsum("fij,fjk->fik", poses, self.mountings)
 
-    def body_poses(self, T_world_sensor: Floats) -> Floats:
-        """Return the poses (F, 4, 4) of the scans, m, the inverse of :meth:`sensor_poses`."""
-        return np.einsum("fij,fjk->fik", T_world_sensor, np.linalg.inv(self.mountings))
-
     def in_body(self, scans: Sequence[Floats]) -> list[Floats]:
         """Transform scans (N_i, 3) from the frames of their radars to that of the body, m."""
         return [scan @ T[:3, :3].T + T[:3, 3] for scan, T in zip(scans, self.mountings, strict=True)]

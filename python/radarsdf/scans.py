@@ -292,7 +292,9 @@ class Scans:
         check(found, f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}")
         poses, times_s, sensors = zip(*found, strict=True)
         self._rig = None if None in sensors else Rig.of(sensors, self._mountings())
-        self._poses = np.stack(poses) if self._rig is None else self._rig.body_poses(np.stack(poses))
+        self._poses = np.stack(poses)
+        if self._rig is not None:  # of the body
+            self._poses = np.einsum("fij,fjk->fik", self._poses, np.linalg.inv(self._rig.mountings))
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
 
     def _read_once(self) -> None:

@@ -69,9 +69,8 @@ def check(
     ('poses_inverted', 'error')
     """
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    rig, scans, poses, intensities, doppler_mps, times_s = filled(
-        points, poses=poses, intensities=intensities, doppler_mps=doppler_mps, times_s=times_s
-    )
+    given = {"poses": poses, "intensities": intensities, "doppler_mps": doppler_mps, "times_s": times_s}
+    rig, scans, poses, intensities, doppler_mps, times_s = filled(points, **given)
     if rig is None:
         return _find(checked_input(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
     T_world_sensor = rig.sensor_poses(pose_matrices(poses, len(rig.of_scan)))

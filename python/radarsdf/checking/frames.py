@@ -41,8 +41,6 @@ _MIN_PAIRS = 3
 
 @dataclass(frozen=True)
 class Effort:
-    """Amounts of data that a check uses."""
-
     pairs: int  # number of pairs of scans
     returns: int  # largest number of returns of a scan in the tree
     queries: int  # returns of a scan looked up in another one

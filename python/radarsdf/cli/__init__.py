@@ -103,15 +103,12 @@ class Results:
 
     def say(self, line: str) -> None:
         """Print a line for people that is no result: with ``--json``, on standard error."""
-        if self.json:
-            warn(line)
-        else:
-            print(line, flush=True)
+        (warn if self.json else self.add)(line)
 
     def add(self, line: str | None = None, **values: Any) -> None:
         """Print a line for people, and keep its values for programs by name; lengths in m, times in s."""
         if line is not None and not self.json:
-            self.say(line)
+            print(line, flush=True)
         self._values |= values
 
     def table(self, rows: Iterable[Sequence[str]]) -> None:

@@ -114,8 +114,7 @@ def render(given: Namespace, results: Results) -> None:
     refuse_if(too_many, f"a picture holds at most {_MAX_PICTURES} poses, not {len(poses)}: write .npz")
     check_outputs([out], [given.map])
     radar_map = load_map(given.map)
-    rng = np.random.default_rng(given.seed)
-    options = {"returns": given.returns, "noise": given.noise, "seed": rng}
+    options = {"returns": given.returns, "noise": given.noise, "seed": np.random.default_rng(given.seed)}
     views: Iterable[View] = (radar_map.render(pose, **options) for pose in poses)
     if suffix == ".png":
         views = list(views)  # a picture shows the whole view; other formats need only the returns

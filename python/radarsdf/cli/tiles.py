@@ -51,8 +51,7 @@ def plan(given: Namespace, results: Results) -> None:
         f"{most / 1e9:.2f} GB for the largest"
     )
     totals |= {name: getattr(planned, name) for name in ("tile_m", "halo_m", "scans")}
-    plan_file = given.out / "plan.json"
-    results.add(line, tiles=len(planned.tiles), memory_bytes=most, plan=plan_file, **totals)
+    results.add(line, tiles=len(planned.tiles), memory_bytes=most, plan=given.out / "plan.json", **totals)
 
 
 def _check_where(given: Namespace) -> None:

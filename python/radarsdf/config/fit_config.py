@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from radarsdf.checks import AnyPath
+from radarsdf.checks import AnyPath, restating
 from radarsdf.config.groups import MAX_THREADS, EncodingConfig, NetworksConfig, ReturnsConfig, TrainingConfig
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
@@ -236,11 +236,8 @@ _WIDTH = 100  # columns of a comment
 
 def read_toml(path: AnyPath) -> dict[str, Any]:
     """Read settings from a TOML file, as :meth:`FitConfig.override` takes them. A ValueError: the file is not TOML."""
-    try:
+    with restating(f"{path} is not a TOML file", ValueError, RecursionError):  # of lists in lists without end
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # RecursionError: lists in lists without end
-        msg = f"{path} is not a TOML file: {error}"
-        raise ValueError(msg) from error
 
 
 def to_toml(config: FitConfig) -> str:

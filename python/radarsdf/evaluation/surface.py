@@ -172,9 +172,8 @@ def _harmonic_mean(a: float, b: float) -> float:
 
 def _triangles(mesh: "trimesh.Trimesh") -> tuple[Floats, Ints]:
     """Vertices (V, 3), world, m, and faces (F, 3) of a mesh of any program."""
-    if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
-        msg = f"mesh must have vertices and faces, not be {mesh!r:.50}"
-        raise TypeError(msg)
+    is_mesh = hasattr(mesh, "vertices") and hasattr(mesh, "faces")
+    check(is_mesh, f"mesh must have vertices and faces, not be {mesh!r:.50}", TypeError)
     vertices, faces = positions(mesh.vertices, "mesh.vertices"), np.asarray(mesh.faces)
     shaped = faces.dtype.kind in "iu" and faces.shape[1:] == (3,)
     fits = faces.size == 0 or (shaped and 0 <= faces.min() <= faces.max() < len(vertices))

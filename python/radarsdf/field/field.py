@@ -153,9 +153,6 @@ class VertexFeatures(nn.Module):
         self.features = nn.Parameter(kernels.large_zeros(self.table.num_rows, FEATURE_DIM))
         self.interpolated_dim = FEATURE_DIM * num_levels
 
-    def initialise(self, generator: torch.Generator) -> None:
-        nn.init.normal_(self.features, std=_FEATURE_STD, generator=generator)
-
     def forward(self, points: Tensor) -> Tensor:
         """Encode points (N, 3), local frame, m: levels concatenated, (N, 8 · num_levels), or summed for an octree, (N, 8)."""
         found = kernels.interpolate(self.features, points, self.table)
@@ -186,7 +183,7 @@ class NeuralField(Field):
         self.sdf_network.initialise(generator)
         if self.intensity_network is not None:
             self.intensity_network.initialise(generator)
-        self.cells.initialise(generator)
+        nn.init.normal_(self.cells.features, std=_FEATURE_STD, generator=generator)
 
     @property
     def smooth_in_cells(self) -> bool:

@@ -10,7 +10,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from radarsdf import _core
-from radarsdf.checks import AnyPath, check, path_of
+from radarsdf.checks import AnyPath, check, path_of, restating
 from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
@@ -61,7 +61,8 @@ class Checkpoint:
         if not self._path.exists():
             return
         expected: dict[str, Tensor] = training.state()
-        try:
+        wrong = f"{self._path} is not a complete checkpoint of this fit"
+        with restating(wrong, Exception, unless=OSError):  # damaged files raise exceptions of many kinds
             with open_tensors(self._path) as file:
                 differing = sorted(set(file.names) ^ set(expected))
                 check(not differing, f"{differing!s:.100} are missing or unexpected")
@@ -71,11 +72,6 @@ class Checkpoint:
                 fits = value.shape == wanted.shape and value.dtype == wanted.dtype and value.isfinite().all()
                 check(fits, f"{name} is not {tuple(wanted.shape)} finite numbers, {wanted.dtype}")
             training.restore(state)
-        except OSError:
-            raise
-        except Exception as error:  # damaged files raise exceptions of many kinds
-            msg = f"{self._path} is not a complete checkpoint of this fit: {error}"
-            raise ValueError(msg) from error
 
     def _check_identity(self) -> None:
         ours = self._identity

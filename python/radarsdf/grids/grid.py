@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
+from scipy.ndimage import distance_transform_edt
 
 from radarsdf.arrays import Bools, Floats, Floats32, Ints
 from radarsdf.checks import check, number, path_of, real_array
@@ -214,7 +215,6 @@ class Grid:
             Known obstacles that the map lacks, world, m: points, or boxes with the lower corner first. Voxels that they touch
             count as occupied; outside the grid they are ignored. Others raise a ValueError.
         """
-        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
         def to_nearest(others: Bools, beyond: bool) -> Floats32:
             """Return distances to the nearest voxel outside the mask `others`. `beyond`: the outside of the grid counts."""
@@ -290,8 +290,6 @@ class Grid:
         ValueError
             If the heights are not ascending, or no column of the grid shows ground.
         """
-        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
-
         ascending = number(lower_m, "lower_m") < number(upper_m, "upper_m")
         check(ascending, f"upper_m must be above lower_m, {lower_m}, not {upper_m}")
         height, _ = self._ground()

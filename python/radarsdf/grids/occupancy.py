@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_erosion
 from scipy.special import ndtr
 
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
@@ -84,8 +85,6 @@ def check_free_space(radar_map: Map, name: str) -> None:
 
 def _fine_grid(radar_map: Map, lower: Floats, size: float, shape: tuple[int, ...]) -> Grid:
     """Compute the grid from a lower corner (3,), world, m, in voxels at most as large as leaf cells."""
-    from scipy.ndimage import binary_erosion  # noqa: PLC0415 - slow to import
-
     leaf_m = radar_map.config.leaf_size_m
     upper = lower + np.array(shape) * size
     cells = radar_map.cells_near(lower - leaf_m, upper + leaf_m)

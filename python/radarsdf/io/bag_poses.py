@@ -30,8 +30,6 @@ _CONSTANT = 1e-9  # largest change of a constant transform that is published rep
 
 @dataclass
 class Track:
-    """Recorded poses of one frame in another."""
-
     parent: str
     child: str = ""  # empty where the messages do not name it
     static: bool = False

@@ -9,14 +9,14 @@ import stat
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import AnyPath, check, path_of
+from radarsdf.checks import AnyPath, check, path_of, restating
 
 _MAX_NAME_BYTES = 255  # limit of nearly all file systems
 _MAX_STEM = 50  # characters of at most four bytes: keeps the temporary name within the limit
@@ -39,15 +39,9 @@ def checked_suffix(path: AnyPath, suffixes: Sequence[str], what: str) -> str:
     return suffix
 
 
-@contextmanager
-def reading(path: AnyPath, what: str, *errors: type[Exception]) -> Iterator[None]:
+def reading(path: AnyPath, what: str, *errors: type[Exception]) -> AbstractContextManager[None]:
     """Turn a ValueError, or one of `errors`, raised in the block into a ValueError that `path` is not `what`."""
-    kinds: tuple[type[Exception], ...] = (ValueError, *errors)
-    try:
-        yield
-    except kinds as error:
-        msg = f"{path} is not {what}: {error}"
-        raise ValueError(msg) from error
+    return restating(f"{path} is not {what}", ValueError, *errors)
 
 
 def check_outputs(outputs: Iterable[AnyPath | None], inputs: Iterable[AnyPath | None] = ()) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from radarsdf.arrays import Array, Bytes, Floats
-from radarsdf.checks import AnyPath, check, path_of, positions
+from radarsdf.checks import AnyPath, check, path_of, positions, restating
 from radarsdf.io.clouds import ply_bytes, ply_header, read_points, records
 from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, write_whole
 from radarsdf.io.npz import TRUTH_ARRAYS, arrays_of
@@ -104,16 +104,12 @@ def read_mesh(path: AnyPath) -> "trimesh.Trimesh":
     import trimesh  # noqa: PLC0415 - takes long
 
     ply = suffix == ".ply"
-    try:
+    # Damaged files raise exceptions of many kinds.
+    with restating(f"{path} cannot be read as a mesh", Exception, unless=OSError):
         source: Any = ply_bytes(file) if ply else file
         mesh: Any = trimesh.load_mesh(source, file_type="ply" if ply else None, process=False)
         faces = mesh.faces
         whole = faces.ndim == 2 and (not len(faces) or 0 <= faces.min() <= faces.max() < len(mesh.vertices))
-    except OSError:
-        raise
-    except Exception as error:  # damaged files raise exceptions of many kinds
-        msg = f"{path} cannot be read as a mesh: {error}"
-        raise ValueError(msg) from error
     check(whole, f"{path}: a triangle refers to a vertex that does not exist")
     if suffix == ".glb":
         mesh.apply_transform(T_GLTF_WORLD.T)

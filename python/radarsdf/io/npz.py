@@ -136,8 +136,7 @@ def write_scans(path: AnyPath, scans: Scans) -> None:
     arrays["frame"] = np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points])
     single = {"poses": scans.poses, "times": scans.times_s, "lidar_points": scans.ground_truth}
     if (rig := scans.rig) is not None:
-        labels = [str(label) for label in rig.labels]
-        single |= {"sensor": rig.of_scan, "sensor_labels": np.array(labels)}
+        single |= {"sensor": rig.of_scan, "sensor_labels": np.array(list(map(str, rig.labels)))}
         single["T_body_sensor"] = rig.T_body_sensor
     if scans.imu is not None:
         single |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))

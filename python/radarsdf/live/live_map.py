@@ -17,7 +17,6 @@ from radarsdf import checks
 from radarsdf.arrays import Floats, Keys
 from radarsdf.checks import check, check_pose, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.config.groups import ReturnsConfig
 from radarsdf.fitting.fit import fit, fit_rays
 from radarsdf.live.state import GrowingState
 from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
@@ -256,7 +255,7 @@ class LiveMap:
         Lost
             If a scan without a pose cannot be registered with the last ones; a ValueError.
         """
-        scan, far = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
+        scan, far = self._check(points, intensities, doppler_mps, time_s)
         mountings = self._state.mountings
         known = sensor is None if mountings is None else sensor in mountings
         check(known, f"sensor must be one of T_body_sensor, {list(mountings or ())}, not {sensor!r:.50}")
@@ -399,9 +398,7 @@ class LiveMap:
             known = dict(zip(ids, refined.poses, strict=True))
             drifted = [placed for placed in now.trajectory() if placed.tracked]
             moved = {placed.scan_id: known.get(placed.scan_id, T @ placed.pose) for placed in drifted}
-            come = {
-                scan_id: dataclasses.replace(now.get(scan_id), pose=pose) for scan_id, pose in moved.items()
-            }
+            come = {k: dataclasses.replace(now.get(k), pose=pose) for k, pose in moved.items()}
             return self._state.exchange(come, come)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
@@ -518,26 +515,19 @@ class LiveMap:
             **known,
         )
 
-
-def _checked_scan(
-    points: ArrayLike,
-    intensities: ArrayLike | None,
-    doppler_mps: ArrayLike | None,
-    time_s: float | None,
-    config: ReturnsConfig,
-) -> tuple[LoggedScan, int]:
-    """Check a scan, without a pose yet, and count returns too far away. Raise a ValueError if it is invalid."""
-    scans, values, left_out = check_scans([points], None if intensities is None else [intensities])
-    scan = scans[0].copy()
-    speeds, static = None, None
-    if doppler_mps is not None:
-        speeds = compact(checks.real_array(doppler_mps, "doppler_mps"))
-        checks.check_values_of_scan(speeds, scan, "doppler_mps", 0)
-        if config.drop_moving:
-            moving = moving_returns([scan], [speeds])[0][0]
-            static = ~moving if moving.any() else None
-    if time_s is not None:
-        time_s, latest = checks.number(time_s, "time_s"), checks.MAX_TIME_S
-        check(abs(time_s) <= latest, f"time_s must be finite and within {latest:g} s, not {time_s:g}")
-    values_of_scan = None if values is None else values[0].copy()
-    return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s), left_out.far
+    def _check(self, points: Any, intensities: Any, doppler_mps: Any, time_s: Any) -> tuple[LoggedScan, int]:
+        """Check a scan, without a pose yet, and count returns too far away. Raise a ValueError if it is invalid."""
+        scans, values, left_out = check_scans([points], None if intensities is None else [intensities])
+        scan = scans[0].copy()
+        speeds, static = None, None
+        if doppler_mps is not None:
+            speeds = compact(checks.real_array(doppler_mps, "doppler_mps"))
+            checks.check_values_of_scan(speeds, scan, "doppler_mps", 0)
+            if self.config.returns.drop_moving:
+                moving = moving_returns([scan], [speeds])[0][0]
+                static = ~moving if moving.any() else None
+        if time_s is not None:
+            time_s, latest = checks.number(time_s, "time_s"), checks.MAX_TIME_S
+            check(abs(time_s) <= latest, f"time_s must be finite and within {latest:g} s, not {time_s:g}")
+        values_of_scan = None if values is None else values[0].copy()
+        return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s), left_out.far

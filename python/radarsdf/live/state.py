@@ -1,7 +1,7 @@
 """State of a live map, and its changes."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial, reduce
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,12 @@ from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sensor import Radars
-from radarsdf.returns.sums import ScanSums, lattice_of
+from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label, Rig
 from radarsdf.threads import resolve_num_threads
 
 _Scans = dict[ScanId, LoggedScan]
+_SAVED = ("noise", "noise_of", "next_id", "with_intensities")  # attributes saved as they are
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # placeholder until it is estimated from scans
 _NOISE_RETURNS = 100_000  # sample for the noise, enough to include the required returns on flat surfels
 # Rays of a fit, for free space and intensities, which take 100 bytes each: surfaces are those of the sums of all.
@@ -68,7 +69,7 @@ class GrowingState:
         self.with_intensities: bool | None = None
         self.next_id = 0
         self.number = 0  # of the state of the sums: another one after each change
-        self._noise_of = 0  # number of scans at the last estimate of the noise
+        self.noise_of = 0  # number of scans at the last estimate of the noise
         self._changed: set[int] = set()  # keys of the blocks to update in the surface
         self._surface: GrowingSurface | None = None
 
@@ -118,7 +119,7 @@ class GrowingState:
     def _bound(self) -> None:
         most = (np.inf if self.log.folder is None else 0) if self.max_bytes is None else self.max_bytes
         if self.num_bytes > most:
-            if self._noise_of == 0 and self.log.folder is None:  # the scans for its estimate may be sealed
+            if self.noise_of == 0 and self.log.folder is None:  # the scans for its estimate may be sealed
                 self._settle_noise()
             self.log = self.log.shrunk(int(max(0, most - (self.num_bytes - self.log.num_bytes))))
 
@@ -150,14 +151,14 @@ class GrowingState:
         regions = np.intersect1d(regions, self._away)
         if len(regions):
             blocks, columns = store.read_regions(self.log.folder, regions, len(self._labels))
-            away = np.setdiff1d(self._away, regions)
-            self._commit(self.sums.insert(columns), blocks, _away=away)
-            store.unlink_regions(self.log.folder, regions)
+            self._commit(self.sums.insert(columns), blocks, _away=np.setdiff1d(self._away, regions))
+            for path in store.region_paths(self.log.folder, regions):
+                with suppress(OSError):  # a leftover file is harmless
+                    path.unlink()
 
     def _put_away(self, regions: Keys) -> Keys:
         blocks, written = store.write_regions(self.log.folder, self.sums, regions)
-        away = np.union1d(self._away, written)
-        return self._commit(self.sums.erase(blocks), blocks, _away=away)
+        return self._commit(self.sums.erase(blocks), blocks, _away=np.union1d(self._away, written))
 
     def changes(self) -> tuple[GrowingSurface, tuple[Any, ...], VisibilityCounts]:
         """Return the last surface, the arguments of its update, and the visibility counts."""
@@ -172,27 +173,21 @@ class GrowingState:
         bits = REGION_BITS - BLOCK_BITS
         in_region = np.arange(1 << int(bits), dtype=np.uint64)
         in_regions = (np.unique(blocks >> bits) << bits)[:, None] | in_region
-        sums = self.sums.weighted(in_regions.ravel(), self.config.leaf_size_m, self.noise)
+        sums = self.sums.weighted(self.config.leaf_size_m, self.noise, in_regions.ravel())
         surface.complete = False
         self._changed.clear()
-        return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
+        return surface, (blocks, sums, self.noise, self._num_threads), self.sums.visibility()
 
     def save(self, path: AnyPath) -> None:
         """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
         ids: list[Any] = [*self.log.ids, *self.log.sealed]
-        mountings: list[Any] | None = None
-        if self.mountings is not None:
-            mountings = [(label, T.tolist()) for label, T in self.mountings.items()]
+        mountings: Any = self.mountings and [(label, T.tolist()) for label, T in self.mountings.items()]
         savable = all(type(name) in (int, str) for name in [*ids, *(self.mountings or ())])
         check(savable, "a map can be saved only if ids of scans and labels are whole numbers or strings")
         scans = list(self.log.scans())
         described = Described(
             config=self.config.to_dict(),
             origin=None if self.origin is None else self.origin.tolist(),
-            noise=self.noise,
-            noise_of=self._noise_of,
-            next_id=self.next_id,
-            with_intensities=self.with_intensities,
             max_bytes=self.max_bytes,
             sealed=ids[len(scans) :],
             ids=ids[: len(scans)],
@@ -201,13 +196,13 @@ class GrowingState:
             tracked=[scan_id for scan_id, scan in zip(ids, scans, strict=False) if scan.tracked],
             mountings=mountings,
             radars=[] if self.mountings is None else [[*self.mountings].index(scan.label) for scan in scans],
+            **{name: getattr(self, name) for name in _SAVED},
         )
         store.save_state(path, described, scans, self.sums)
 
     def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[Sequence[Array]]) -> None:
         at_once(*self.sums.insert(sums))
-        self.noise, self._noise_of = described.noise, described.noise_of
-        self.next_id, self.with_intensities = described.next_id, described.with_intensities
+        vars(self).update({name: getattr(described, name) for name in _SAVED})
         self.log = self.log.exchanged(dict(zip(described.ids, scans, strict=True)), ())
         self.log.sealed |= set(described.sealed)
         self._bound()
@@ -220,7 +215,8 @@ class GrowingState:
 
     def fit_input(self) -> Callable[[], FitInput]:
         """Return a function for the input of a fit of all scans, with the incremental sums, and an even sample of many rays."""
-        sums, visibility, origin = self._all_sums(self.noise), self._visibility(), self.origin
+        sums = self.sums.weighted(self.config.leaf_size_m, self.noise)
+        visibility, origin = self.sums.visibility(), self.origin
         every = 1 + int(sums.counts.sum()) // _FIT_RETURNS
         scans, is_part = self.scans(every), every > 1 or bool(self.log.sealed)
 
@@ -236,18 +232,12 @@ class GrowingState:
 
         return read
 
-    def _all_sums(self, noise: SensorNoise) -> ScanSums:
-        return self.sums.weighted(self.sums.block_keys(), self.config.leaf_size_m, noise)
-
-    def _visibility(self) -> VisibilityCounts:
-        return self.sums.visibility(self.sums.block_keys())
-
     def _settle_noise(self) -> None:
         """Estimate the sensor's noise if the number of scans has doubled or halved since the last time."""
         scans = len(self.log)
-        if self._noise_of / 2 < scans < 2 * self._noise_of:
+        if self.noise_of / 2 < scans < 2 * self.noise_of:
             return
-        sums = self._all_sums(_UNKNOWN)
+        sums = self.sums.weighted(self.config.leaf_size_m, _UNKNOWN)
         asked = list(self.log.scans(every=max(1, int(sums.counts.sum()) // _NOISE_RETURNS)))
         if asked:
             estimate = sensor_noise if self.mountings is None else rig_noise
@@ -255,7 +245,7 @@ class GrowingState:
             noise = estimate(surfels, rays, self.config.returns, self._num_threads)
             if self.mountings is not None:  # it weights all sums
                 self._changed.update(self.sums.block_keys().tolist())
-            vars(self).update(noise=noise, _noise_of=scans)
+            vars(self).update(noise=noise, noise_of=scans)
 
     def _rays_of(self, scans: Sequence[LoggedScan], origin: Floats | None) -> Rays:
         """Return the rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""

@@ -14,8 +14,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from radarsdf import checks
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Keys
-from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, check_values_of_scan, positions
+from radarsdf.checks import AnyPath, check, restating
 from radarsdf.io.files import check_regular_file, reading, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.sums import RadarSums
@@ -138,12 +139,8 @@ class _Rows:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        try:
-            with self._opened:
-                yield self._opened
-        except sqlite3.Error as error:
-            msg = f"{self._path}: {error}"
-            raise OSError(msg) from error
+        with restating(str(self._path), sqlite3.Error, kind=OSError), self._opened:
+            yield self._opened
 
 
 class ScanLog:
@@ -302,7 +299,7 @@ def _pose_of(blob: bytes) -> Floats:
     return np.frombuffer(blob).reshape(4, 4).copy()
 
 
-def _region_paths(folder: Path | None, regions: Keys) -> list[Path]:
+def region_paths(folder: Path | None, regions: Keys) -> list[Path]:
     """Return the files of regions (R,), which hold their sums bit-identically."""
     return [(folder or Path()) / f"region-{region:016x}.npz" for region in regions.tolist()]
 
@@ -312,7 +309,7 @@ def write_regions(folder: Path | None, sums: RadarSums, regions: Keys) -> tuple[
     blocks = sums.block_keys()
     region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
     written = np.intersect1d(regions, region_of_block)
-    for region, path in zip(written, _region_paths(folder, written), strict=True):
+    for region, path in zip(written, region_paths(folder, written), strict=True):
         _save(path, **arrays_of_sums(sums, blocks[region_of_block == region]))
     return blocks[np.isin(region_of_block, written)], written
 
@@ -320,18 +317,12 @@ def write_regions(folder: Path | None, sums: RadarSums, regions: Keys) -> tuple[
 def read_regions(folder: Path | None, regions: Keys, num_radars: int) -> tuple[Keys, list[tuple[Array, ...]]]:
     """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums, of each radar."""
     read = []
-    for path in _region_paths(folder, regions):
+    for path in region_paths(folder, regions):
         with reading(path, "a whole region of a live map"):
-            read.append(_sums_of(arrays_of(path, _columns_of(num_radars)), num_radars))
+            read.append(_read_sums(path, num_radars))
     columns = [tuple(map(np.concatenate, zip(*parts, strict=True))) for parts in zip(*read, strict=True)]
     each = [np.union1d(visibility_keys, keys >> BLOCK_BITS) for keys, _, _, visibility_keys, _ in columns]
     return reduce(np.union1d, each), columns
-
-
-def unlink_regions(folder: Path | None, regions: Keys) -> None:
-    for path in _region_paths(folder, regions):
-        with suppress(OSError):  # a leftover file is harmless
-            path.unlink()
 
 
 def _columns_of(num_radars: int) -> dict[str, tuple[Any, ...]]:
@@ -345,9 +336,10 @@ def arrays_of_sums(sums: RadarSums, blocks: Keys) -> dict[str, Array]:
     return dict(zip(_columns_of(len(sums)), chain(*sums.columns(blocks)), strict=True))
 
 
-def _sums_of(arrays: dict[str, Array], num_radars: int) -> list[tuple[Array, ...]]:
-    """Return the columns of cells and blocks of a file, of each radar. The core relies on ascending keys and non-empty cells."""
+def _read_sums(path: AnyPath, num_radars: int) -> list[tuple[Array, ...]]:
+    """Read the columns of cells and blocks of each radar. The core relies on ascending keys and non-empty cells."""
     wanted, width = _columns_of(num_radars), len(_CELL_COLUMNS)
+    arrays = arrays_of(path, wanted)
     check_arrays(arrays, wanted)
     columns = [np.ascontiguousarray(arrays[name]) for name in wanted]
     found = [tuple(columns[first : first + width]) for first in range(0, len(columns), width)]
@@ -356,7 +348,7 @@ def _sums_of(arrays: dict[str, Array], num_radars: int) -> list[tuple[Array, ...
     return found
 
 
-_Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+_Coordinate = Annotated[float, Field(ge=-checks.MAX_POSITION_M, le=checks.MAX_POSITION_M)]
 _Count = Annotated[int, Field(ge=0, le=2**62)]
 
 
@@ -406,18 +398,17 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], list[tuple[A
         check(described.origin is not None or not ids, "the origin is missing")
         names = [f"{name} {i}" for i in range(len(described.ids)) for name in _KINDS]
         scans, radars = [], [Mounted(*of) for of in (described.T_body_sensor or {}).items()]
-        num_radars = max(len(radars), 1)
-        arrays = arrays_of(path, (*_columns_of(num_radars), *names))
+        arrays = arrays_of(path, names)
         numbers = described.radars if radars else [0] * len(described.ids)
         each = zip(described.ids, described.poses, described.times_s, numbers, strict=True)
         for i, (scan_id, pose, time_s, k) in enumerate(each):
             held: dict[str, Any] = {name: arrays[key] for name in _KINDS if (key := f"{name} {i}") in arrays}
-            points = positions(held["points"], "points")
+            points = checks.positions(held["points"], "points")
             for name, array in held.items():
                 if name != "points":
-                    check_values_of_scan(array, points, name, 0)
+                    checks.check_values_of_scan(array, points, name, 0)
                 check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
             mounted = radars[k] if radars else None
             known: dict[str, Any] = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}
-            scans.append(LoggedScan(check_pose(pose, "pose"), **held, **known))
-        return described, scans, _sums_of(arrays, num_radars)
+            scans.append(LoggedScan(checks.check_pose(pose, "pose"), **held, **known))
+        return described, scans, _read_sums(path, max(len(radars), 1))

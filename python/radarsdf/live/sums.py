@@ -48,8 +48,9 @@ class RadarSums:
         """Return the contents of blocks with ascending keys (B,), of each radar."""
         return [(*table.sums_of(blocks), *table.visibility_of(blocks)) for table in self._tables]
 
-    def weighted(self, blocks: Keys, leaf_size_m: float, noise: SensorNoise) -> ScanSums:
-        """Sum over the radars in blocks with ascending keys (B,), weighted by the noise of each, if known."""
+    def weighted(self, leaf_size_m: float, noise: SensorNoise, blocks: Keys | None = None) -> ScanSums:
+        """Sum over the radars, weighted by the noise of each, if known, in blocks with ascending keys (B,); None: in all."""
+        blocks = self.block_keys() if blocks is None else blocks
         keys, sums, scans = zip(*(table.sums_of(blocks) for table in self._tables), strict=True)
         total_scans = _total(keys, scans)[1]
         if not isinstance(noise, RigNoise):
@@ -57,8 +58,8 @@ class RadarSums:
         weighted = [part * own for part, own in zip(noise.parts, sums, strict=True)]
         return ScanSums(leaf_size_m, *_total(keys, weighted), total_scans, WEIGHT_UNIT)
 
-    def visibility(self, blocks: Keys) -> VisibilityCounts:
-        """Return the visibility counts of those blocks with ascending keys (B,) that there are."""
+    def visibility(self) -> VisibilityCounts:
+        blocks = self.block_keys()
         each = [table.visibility_of(blocks) for table in self._tables]
         return VisibilityCounts(*_total(*zip(*each, strict=True)))
 

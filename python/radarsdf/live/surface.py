@@ -251,8 +251,7 @@ class GrowingSurface:
     def _find_leaf_cells(self, regions: Keys, num_threads: int) -> tuple[Keys, Keys]:
         """Find the leaf cells near `regions`, in which rays changed. Return them, and those that came or went, ascending."""
         rays, _ = self._true_means(regions_near(regions, 1))
-        band_m = self._config.metres(BAND_CELLS)
-        crossed = rays.leaf_keys(self._config.leaf_size_m, band_m, num_threads)
+        crossed = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
         self._crossed.put(regions, {"keys": crossed})
         # Bridges depend on medians over blocks of 32 cells, and on their two ends, which they lack at the border.
         own, around = regions_near(regions, 2), regions_near(regions, 3)

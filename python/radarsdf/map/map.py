@@ -19,6 +19,7 @@ from radarsdf.map.colors import intensity_colors
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, confidence, free_space_odds, uncertainty
 from radarsdf.map.queries import MapContents
 from radarsdf.map.threshold import VOXEL_M
+from radarsdf.map.view import DepthImage, View, ViewedMap, view_from
 from radarsdf.memory import check_views
 from radarsdf.products import turned
 from radarsdf.returns.intensities import IntensityScale
@@ -28,8 +29,6 @@ from radarsdf.rig import Label
 
 if TYPE_CHECKING:
     import trimesh
-
-    from radarsdf.map.view import DepthImage, View, ViewedMap
 
 Query = Callable[..., Array]
 
@@ -229,7 +228,7 @@ class Map(ABC):
             check(is_position, f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m")
         limits = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
         limits["min_component_triangles"] = min_component_triangles
-        mesh: Any = self._surface_mesh(voxel_size, box=box, progress=progress, **limits)
+        mesh = self._surface_mesh(voxel_size, box=box, progress=progress, **limits)
         if viewpoint is None or scale is None:
             return mesh
         values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position).astype(np.float32)
@@ -245,7 +244,7 @@ class Map(ABC):
         returns: float | None = None,
         noise: bool = False,
         seed: int | np.random.Generator = 0,
-    ) -> "View":
+    ) -> View:
         """Predict the scan of a radar at a pose, and the first surface along each of its beams.
 
         Beams are traced to the surface that :meth:`mesh` keeps by default. Returns are placed on patches of the field's surface in
@@ -280,8 +279,6 @@ class Map(ABC):
         MemoryError
             If the view would need more memory than available. At most 10^6 beams are traced.
         """
-        from radarsdf.map.view import view_from  # noqa: PLC0415 - trimesh is slow to import
-
         pose = check_pose(T_world_sensor, "T_world_sensor")
         radar = self._radar(sensor)
         viewed = self._viewed_from(pose[:3, 3], radar.range_m[1])
@@ -294,7 +291,7 @@ class Map(ABC):
         size: tuple[int, int],
         *,
         max_range_m: float = 100.0,
-    ) -> "DepthImage":
+    ) -> DepthImage:
         """Render the surface that :meth:`mesh` keeps by default, as seen by a pinhole camera.
 
         Parameters
@@ -320,8 +317,6 @@ class Map(ABC):
         MemoryError
             If the image would need more memory than available.
         """
-        from radarsdf.map.view import DepthImage  # noqa: PLC0415 - as above
-
         pose, K = check_pose(T_world_camera, "T_world_camera"), real_array(camera, "camera")
         invertible = K.shape == (3, 3) and np.linalg.matrix_rank(K) == 3
         check(invertible, f"camera must be an invertible (3, 3) matrix, not {K}")
@@ -444,11 +439,11 @@ class Map(ABC):
     def _observed(self, world: Floats) -> Bools: ...
 
     @abstractmethod
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
+    def _surface_mesh(self, voxel_size: float, *, box: Any, progress: bool | None, **wanted: Any) -> Any:
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     @abstractmethod
-    def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
         """Return the data for views from a position (3,) within a range, cached for the next view."""
 
     def tangent_planes(self, x: Floats) -> tuple[Floats, Floats]:

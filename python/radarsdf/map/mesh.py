@@ -4,16 +4,15 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from radarsdf._core import marching_cubes_sparse, mesh_components, vertex_areas
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
-from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
@@ -21,6 +20,9 @@ from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_memory
+
+if TYPE_CHECKING:
+    import trimesh
 
 _MAX_VOXELS = 2**30  # duplicates included. Lattice coordinates and rows of corners are int32
 _MEMORY_PER_VOXEL = 220.0  # bytes, measured
@@ -76,14 +78,16 @@ class Surface:
             kept[rows] = large.take(labels)
         return kept
 
-    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
+    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> "trimesh.Trimesh":
         """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         threshold = self.tally.threshold(limits.min_confidence)
         return self.part(origin, self.kept(limits), **counts, **vars(threshold))
 
-    def part(self, origin: Floats, kept: Bools, **metadata: float) -> trimesh.Trimesh:
+    def part(self, origin: Floats, kept: Bools, **metadata: float) -> "trimesh.Trimesh":
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
+        import trimesh  # noqa: PLC0415 - slow
+
         used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
         rows = np.flatnonzero(used)
         mesh = trimesh.Trimesh(self.vertices.take(rows, axis=0) + origin, faces, process=False)
@@ -91,18 +95,6 @@ class Surface:
         mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m.take(rows)
         mesh.metadata |= metadata
         return mesh
-
-
-def extract_mesh(
-    contents: MapContents, voxel_size: float, *, box: ArrayLike | None, progress: bool | None, **wanted: Any
-) -> trimesh.Trimesh:
-    """Extract the mesh of one map. `wanted`: the limits of :meth:`Map.mesh`."""
-    voxel_size = positive(voxel_size, "voxel_size")
-    check(voxel_size <= MAX_POSITION_M, f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}")
-    limits = Limits.of(voxel_size, **wanted)
-    local_box = None if box is None else check_box(box) - contents.origin
-    surface = Surface.of(contents, voxel_size, local_box, progress)
-    return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
 
 
 def with_all(good: Bools, faces: Ints32) -> Bools:

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 from typing_extensions import TypedDict
 
 from radarsdf.arrays import Array, Bools, Floats, Keys
-from radarsdf.checks import AnyPath, check
+from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, GridField, NeuralField
 from radarsdf.io.files import check_regular_file, reading, write_whole
@@ -24,7 +24,10 @@ from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map import queries
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, dense_cells, evidence
 from radarsdf.map.map import Map, Query
+from radarsdf.map.mesh import Surface
 from radarsdf.map.queries import MapContents
+from radarsdf.map.threshold import Limits
+from radarsdf.map.view import ViewedMap
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.reflectance import Reflectance
@@ -32,11 +35,6 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
 from radarsdf.returns.view_statistics import FreeSpace, ViewStatistics, ViewStatisticsAt
 from radarsdf.settings import by_name, first_wrong
-
-if TYPE_CHECKING:
-    import trimesh
-
-    from radarsdf.map.view import ViewedMap
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 14
@@ -86,10 +84,13 @@ class RadarMap(Map):
     def contents_of_any(self) -> MapContents:
         return self._contents
 
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
-        from radarsdf.map.mesh import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
-
-        return extract_mesh(self._contents, voxel_size, **wanted)
+    def _surface_mesh(self, voxel_size: float, *, box: Any, progress: bool | None, **wanted: Any) -> Any:
+        voxel_m = positive(voxel_size, "voxel_size")
+        check(voxel_m <= MAX_POSITION_M, f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_m}")
+        limits = Limits.of(voxel_m, **wanted)
+        local_box = None if box is None else check_box(box) - self.origin
+        surface = Surface.of(self._contents, voxel_m, local_box, progress)
+        return surface.mesh(self.origin, limits, self.num_cells)
 
     def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         leaf_m = self.config.leaf_size_m
@@ -105,13 +106,11 @@ class RadarMap(Map):
     def view_statistics(self) -> ViewStatisticsAt:
         return self._contents.views_in_world()
 
-    def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":  # noqa: ARG002 - the whole map
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
         return self._viewed
 
     @cached_property
-    def _viewed(self) -> "ViewedMap":
-        from radarsdf.map.view import ViewedMap  # noqa: PLC0415 - trimesh is slow to import
-
+    def _viewed(self) -> ViewedMap:
         return ViewedMap.of(self._contents)
 
     def save(self, path: AnyPath) -> None:
@@ -222,9 +221,8 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     check((evidence["information"] >= 0).all(), "information is negative")
     free_space = FreeSpace(**_taken(tensors, _PARTS["free_space"], "free_space."))
     free_space.check()
-    sigma = float(description["view_sigma"])
     views = _taken(tensors, _PARTS["view_statistics"], "view_statistics.")
-    view_statistics = ViewStatistics(**views, sigma=sigma)
+    view_statistics = ViewStatistics(**views, sigma=float(description["view_sigma"]))
     view_statistics.check(config.leaf_size_m)
     limits = description["intensity_scale"]
     scale = None if limits is None else IntensityScale.between(limits)

@@ -85,8 +85,6 @@ class _Motion:
 
 @dataclass(frozen=True)
 class BodyPath:
-    """Estimates."""
-
     knots_s: Floats
     positions: Floats  # (J, 3)
     turns: Floats  # (J, 3) rotation vectors, world

@@ -190,7 +190,6 @@ class ImuAlignment:
 
     @property
     def report(self) -> dict[str, Any]:
-        """Entry of the report of the poses."""
         keys = ("R_sensor_imu", "sigma_rad", "time_offset_s", "lever_m")
         return {key: np.asarray(getattr(self, key)).tolist() for key in keys}
 

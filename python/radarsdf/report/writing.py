@@ -113,7 +113,6 @@ def require_extras() -> None:
 
 def write_report(path: AnyPath, subject: Subject) -> int:
     """Write a self-contained HTML page about a map atomically, and return its size, bytes. Needs matplotlib and viser."""
-    require_extras()
     report = subject.radar_map.report
     settings, defaults = (flat_settings(of.to_dict()) for of in (subject.radar_map.config, FitConfig()))
     of_surface = {"surface": surface_values, "errors": error_values, "uncertainty": uncertainty_values}
@@ -140,7 +139,6 @@ def write_changes_report(
     `names`: of the earlier and the later map. `edge_m`: vertex spacing of their surfaces. `regions`: the changes to
     list, largest first. Raises an ImportError if matplotlib or viser is missing, an OSError if the file cannot be written.
     """
-    require_extras()
     mesh: Any = thinned(changes.mesh(), MAX_VERTICES, edge_m)[0]
     surface = None
     if len(mesh.faces):
@@ -151,7 +149,6 @@ def write_changes_report(
 
 
 def surface_values(subject: Subject) -> dict[str, Any]:
-    """Values of the surface section."""
     mesh, _ = subject.shown
     colors, legend = _colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
     origin = subject.radar_map.origin
@@ -172,7 +169,6 @@ def error_values(subject: Subject) -> dict[str, Any] | None:
 
 
 def uncertainty_values(subject: Subject) -> dict[str, Any]:
-    """Values of the uncertainty section."""
     mesh, (shown, _) = subject.mesh, subject.shown
     sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
     shown_m, percentiles = shown.vertex_attributes["uncertainty_m"], [10, 50, 90]

@@ -72,7 +72,11 @@ def fit_response(values: Floats32, views: Views) -> tuple[Floats, Floats32]:
     coefficients[:, :_BASE] = regression(rays, y)
     left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
     table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
-    table[~_near(_bins(_log_range(ranges_m), directions[:, 2]))] += _UNMEASURED
+    bins = _bins(_log_range(ranges_m), directions[:, 2])
+    returns = np.bincount(bins, minlength=table.size).reshape(TABLE_SHAPE)
+    # Within a standard deviation of the widest kernels from a return.
+    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
+    table[product(product(by_range, returns), by_elevation) <= 0] += _UNMEASURED
     for kind in (LEVEL, STEEP):
         own = chosen == kind
         if np.count_nonzero(own) >= _FEWEST:
@@ -84,7 +88,6 @@ def fit_response(values: Floats32, views: Views) -> tuple[Floats, Floats32]:
 
 @np.errstate(under="ignore")
 def response(coefficients: Floats, table: Floats32, views: Views) -> Floats32:
-    """Predict values (N,) for views."""
     directions, ranges_m, incidence_rad, kinds = views
     of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
     by_angle = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in coefficients]
@@ -186,13 +189,6 @@ def _smooth_means(bins: Ints32, values: Floats) -> Floats:
     return means
 
 
-def _near(bins: Ints32) -> Bools:
-    """Return a mask of the table: entries within a standard deviation of the widest kernels from a return."""
-    returns = np.bincount(bins, minlength=TABLE_SHAPE[0] * TABLE_SHAPE[1]).reshape(TABLE_SHAPE)
-    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
-    return product(product(by_range, returns), by_elevation) > 0
-
-
 def _kernels(widths: tuple[float, float]) -> list[Floats]:
     """Return Gaussian weights of pairs of bins by range and of pairs by elevation; 1 on the diagonals."""
     bins = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
@@ -280,7 +276,8 @@ class Reflectance:
         plane = surfels.flat_planes_at(points, num_threads)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)
-        groups = _groups(points, directions, incidence, kind)
+        few = len(points) <= _MOST_RETURNS  # of few returns, each is its own group
+        groups = np.arange(len(points)) if few else cell_rows(kind, points, directions, incidence)[0]
         places = _means(points, groups), _means(directions, groups)
         times, share = 1.0, 0.0
         if ask is not None:
@@ -342,13 +339,6 @@ def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats
     angle: Floats32 = np.arccos(np.minimum(cosine, np.float32(1)))
     angle[plane < 0] = np.nan
     return angle
-
-
-def _groups(points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> Ints | Ints32:
-    """Group returns by place and view: return the row (N,) of each one's group. With few returns, each is its own."""
-    if len(points) <= _MOST_RETURNS:
-        return np.arange(len(points))
-    return cell_rows(kind, points, directions, incidence_rad)[0]
 
 
 def _means(values: Floats32, groups: Ints | Ints32) -> Floats32:

@@ -160,7 +160,10 @@ class Sensor:
         if rays.intensities is not None:
             values = rays.intensities[rows].astype(np.float64)
             known = np.isfinite(values)
-            thresholds = _thresholds(range_m[known], values[known])
+            order = np.lexsort((values[known], range_m[known]))  # equal ranges in an order of their own
+            bins = [rows for rows in np.array_split(np.flatnonzero(known)[order], _RANGE_BINS) if len(rows)]
+            of_bins = ((np.median(range_m[rows]), np.quantile(values[rows], _WEAKEST)) for rows in bins)
+            thresholds = tuple(sorted({float(at_m): float(weakest) for at_m, weakest in of_bins}.items()))
         per_scan = np.bincount(rays.scans)
         return cls(
             azimuth_rad=_limits(np.arctan2(y, x)),
@@ -183,14 +186,6 @@ def _limits(values: Floats) -> tuple[float, float]:
     if low == high:  # very few returns
         low -= 1e-3 * max(abs(low), 1e-3)
     return float(low), float(high)
-
-
-def _thresholds(ranges_m: Floats, intensities: Floats) -> tuple[tuple[float, float], ...]:
-    """Return the median range and the robust weakest intensity of range bins with equal counts."""
-    order = np.lexsort((intensities, ranges_m))  # equal ranges in an order of their own
-    bins = [part for part in np.array_split(order, _RANGE_BINS) if len(part)]
-    of_bins = ((np.median(ranges_m[part]), np.quantile(intensities[part], _WEAKEST)) for part in bins)
-    return tuple(sorted({float(range_m): float(weakest) for range_m, weakest in of_bins}.items()))
 
 
 _MOST_RETURNS = 60_000  # sample size

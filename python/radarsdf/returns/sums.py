@@ -128,8 +128,7 @@ class MeanRays:
 
     @classmethod
     def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> "MeanRays":
-        means = mean_rays(sums.keys, sums.sums, sums.leaf_size_m, num_threads)
-        points, directions, ranges_m, counts = means
+        points, directions, ranges_m, counts = mean_rays(sums.keys, sums.sums, sums.leaf_size_m, num_threads)
         return cls(sums.keys, points, directions, counts / np.float32(sums.unit), sums.scans, ranges_m)
 
     def select(self, part: Bools | Ints) -> "MeanRays":

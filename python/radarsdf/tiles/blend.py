@@ -78,8 +78,7 @@ class TileBlend(Map):
 
     def leaf_cells(self, of: TilePlan, within: TilePlan) -> Ints:
         """(C, 3) leaf cells, by lattice indices, of the map of one finished tile that lie in another one."""
-        keys = load_leaf_keys(map_path(self.folder, of))
-        cells = lattice_of(keys).astype(np.int64) + of.origin_cells
+        cells = lattice_of(load_leaf_keys(map_path(self.folder, of))).astype(np.int64) + of.origin_cells
         return cells[(cells[:, :2] // self.plan.tile_cells == within.tile).all(axis=1)]
 
     def _shares(self, world: Floats) -> Iterator[Share]:

@@ -23,7 +23,7 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.scans import Scan, Scans
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
-from radarsdf.tiles.planning import SCANS_FILE, checked_scans, make_plan, read_rays
+from radarsdf.tiles.planning import SCANS_FILE, Planner, checked_scans, read_rays
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
@@ -113,7 +113,7 @@ def plan_tiles(
             if not (folder / PLAN).is_file():  # another process may have just written it
                 shutil.rmtree(folder / TILES, ignore_errors=True)  # left by an unfinished plan
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
-                plan = make_plan(given, digest, folder, config, grid)
+                plan = Planner(folder, config, grid).plan(given, digest)
                 plan.save(folder)
                 return plan
     plan = Plan.load(folder)  # must be of the same scans and settings

@@ -4,20 +4,19 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from radarsdf._core import marching_cubes_sparse
 from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
-from radarsdf.checks import AnyPath, check, check_box, hides_bar, path_of, positive
-from radarsdf.io.files import check_outputs, checked_suffix, reading, write_whole
-from radarsdf.io.meshes import MATT, MESH_SUFFIXES, T_GLTF_WORLD, encode_glb, write_mesh
+from radarsdf.checks import check, check_box, hides_bar, positive
+from radarsdf.io.files import check_outputs, reading, write_whole
+from radarsdf.io.meshes import MATT, T_GLTF_WORLD, encode_glb
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import sparse_lattice
@@ -27,6 +26,9 @@ from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_memory, check_views
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import TilePlan, folder_of
+
+if TYPE_CHECKING:
+    import trimesh
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
@@ -132,7 +134,7 @@ def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]
     return together, own[merged]
 
 
-def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> trimesh.Trimesh:
+def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> "trimesh.Trimesh":
     paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     file_bytes = sum(path.stat().st_size for path in paths)
     count, most = file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes
@@ -146,22 +148,7 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted:
     return whole.mesh(np.zeros(3), limits, leaf_cells)
 
 
-def export_mesh(
-    city: TileBlend, path: AnyPath, voxel_size: float, progress: bool | None, **limits: Any
-) -> tuple[int, int]:
-    """See :meth:`TiledMap.export`. Unwritable paths are detected before the work."""
-    if path_of(path, "path").suffix.lower() == ".json":
-        return _write_tileset(city, Path(path), voxel_size, progress, **limits)
-    checked_suffix(path, MESH_SUFFIXES, "meshes")
-    check_outputs([path])
-    mesh = mesh_of(city, voxel_size, progress, **limits)
-    check(len(mesh.faces) != 0, f"{city.folder} has no surface here: nothing written")
-    write_mesh(path, mesh)
-    return len(mesh.vertices), len(mesh.faces)
-
-
 def viewed_tiles(city: TileBlend, tiles: list[TilePlan]) -> ViewedMap:
-    """Arguments of views of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(tiles[0].origin_cells)
@@ -187,7 +174,7 @@ _ERROR_OF_EDGE = 1 / 16
 _GREY = MATT["pbrMetallicRoughness"] | {"baseColorFactor": [0.784, 0.784, 0.784, 1.0]}
 
 
-def _write_tileset(
+def write_tileset(
     city: TileBlend, path: Path, voxel_size: float, progress: bool | None, **wanted: Any
 ) -> tuple[int, int]:
     """Write ``NAME.json`` and in a folder ``NAME`` a GLB file per tile with triangles.
@@ -195,6 +182,8 @@ def _write_tileset(
     GLB files hold float32 relative to the origin of the tile, which is float64 in the JSON: precision does not depend on the
     distance from the world's origin. Components that reach a border are kept.
     """
+    import trimesh  # noqa: PLC0415 - slow
+
     folder = path.with_suffix("")
     check_outputs([path])
     folder.mkdir(exist_ok=True)

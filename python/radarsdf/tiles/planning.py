@@ -15,7 +15,7 @@ import numpy as np
 
 from radarsdf._core import cell_keys
 from radarsdf.arrays import Bools, Floats, Ints
-from radarsdf.checks import are_rigid, check, one_for_each_scan
+from radarsdf.checks import are_rigid, check, one_for_each_scan, restating
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
@@ -61,16 +61,6 @@ def checked_scans(scans: Iterable[Any], digest: hashlib.blake2b) -> Iterator[Sca
         _LOG.warning(note)
 
 
-def make_plan(
-    scans: Iterable[Scan], digest: hashlib.blake2b, folder: Path, config: FitConfig, grid: TileGrid
-) -> Plan:
-    """Read scans once, write the rays of each tile, and return the plan. `digest`: of the scans, after they are read."""
-    planner = _Planner(folder, config, grid)
-    for chunk in _chunks(scans, config.returns.accumulate_scans):
-        planner.add(chunk)
-    return planner.plan(digest.hexdigest())
-
-
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
     """Yield lists of consecutive scans that keep the groups to accumulate whole."""
     chunk: list[Scan] = []
@@ -87,8 +77,6 @@ def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
 
 
 class _Returns:
-    """Returns of a radar, as far as its model needs them."""
-
     def __init__(self) -> None:
         self.samples: list[tuple[int, Scan]] = []  # scans with the smallest hashes
         self.intensities = Intensities()
@@ -98,7 +86,7 @@ class _Returns:
         self.samples = sorted(self.samples, key=itemgetter(0))[:_SENSOR_SCANS]
 
 
-class _Planner:
+class Planner:
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
         self._folder, self._config, self._grid = folder, config, grid
         self._origins: dict[Tile, Ints] = {}  # (3,) origins of the tiles' maps, leaf cells
@@ -107,7 +95,7 @@ class _Planner:
         self._radars: dict[Label, _Returns] = {}
         self._with_intensities: bool | None = None
 
-    def add(self, scans: list[Scan]) -> None:
+    def _add(self, scans: list[Scan]) -> None:
         first = sum(map(len, self._axes))
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
@@ -153,14 +141,15 @@ class _Planner:
     def _rays(self, scans: list[Scan], first: int) -> Rays:
         """Prepare the static returns, checked, in a frame of their own."""
         held = scans_in_memory(scans)
-        try:
+        where = f"of the {len(scans)} scans from number {first} on, numbered from 0"
+        with restating(where, ValueError, TypeError):
             given = held.points, held.poses, held.intensities, held.doppler_mps, held.rig
             return static_rays(*given, self._config, whole=False)[0]
-        except (ValueError, TypeError) as error:
-            msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
-            raise ValueError(msg) from error
 
-    def plan(self, input_digest: str) -> Plan:
+    def plan(self, scans: Iterable[Scan], digest: hashlib.blake2b) -> Plan:
+        """Read scans once, write the rays of each tile, and return the plan. `digest`: of the scans, after they are read."""
+        for chunk in _chunks(scans, self._config.returns.accumulate_scans):
+            self._add(chunk)
         check(self._axes, "there are no scans")
         tiles = []
         for tile, (returns, rays) in sorted(self._counts.items()):
@@ -189,7 +178,7 @@ class _Planner:
             sensor=radars[0].sensor,
             radars=tuple(radars),
             scans=len(axes),
-            input_digest=input_digest,
+            input_digest=digest.hexdigest(),
             tiles=tuple(tiles),
         )
         plan = self._completed(draft)
@@ -238,7 +227,11 @@ class _Planner:
         noise = SensorNoise.median([of_tile.mean for of_tile in noises])
         of_rigs = (rig.of_sensors for rig in noises if isinstance(rig, RigNoise))
         own_noise = [*map(SensorNoise.median, zip(*of_rigs, strict=True))] or [noise]
-        radars, same_unit = [], _median_units(units)
+        # Medians of the tiles in which the units are relative to the first radar.
+        alike = [of_tile for of_tile in units if of_tile[0] == SAME_UNIT] or units[:1]
+        each = ([unit for unit in of_radar if unit is not None] for of_radar in zip(*alike, strict=True))
+        same_unit: list[Unit] = [tuple(np.median(own or [SAME_UNIT], axis=0).tolist()) for own in each]
+        radars = []
         for radar, own, unit in zip(plan.radars, own_noise, same_unit, strict=True):
             model = dataclasses.replace(radar.sensor, noise=own, unit=unit)
             radars.append(dataclasses.replace(radar, sensor=model))
@@ -260,13 +253,6 @@ class _Planner:
         values = [in_map_unit(*own) for own in measured]
         limits = {name: getattr(self._config.returns, name) for name in ("min_range_m", "max_range_m")}
         return Sensor.of([scan.points for scan, _ in scans], values or None, **limits)
-
-
-def _median_units(of_tiles: list[tuple[Unit | None, ...]]) -> list[Unit]:
-    """Medians of the units of each radar, of the tiles in which they are relative to the first radar; `SAME_UNIT` without any."""
-    alike = [units for units in of_tiles if units[0] == SAME_UNIT] or of_tiles[:1]
-    each = ([unit for unit in of_radar if unit is not None] for of_radar in zip(*alike, strict=True))
-    return [tuple(np.median(units or [SAME_UNIT], axis=0).tolist()) for units in each]
 
 
 def rays_path(folder: Path, tile: Tile) -> Path:

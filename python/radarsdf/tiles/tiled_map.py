@@ -3,25 +3,25 @@
 import shutil
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import AnyPath, path_of
+from radarsdf.checks import AnyPath, check, path_of
+from radarsdf.io.files import check_outputs, checked_suffix
+from radarsdf.io.meshes import MESH_SUFFIXES, write_mesh
 from radarsdf.map.confidence import CellsInBox, dense_cells
 from radarsdf.map.map import Map
 from radarsdf.map.radar_map import RadarMap, load_contents
 from radarsdf.map.threshold import VOXEL_M, Threshold
+from radarsdf.map.view import ViewedMap
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
+from radarsdf.tiles.mesh import mesh_of, parts_of, viewed_tiles, write_tileset
 from radarsdf.tiles.plan import TilePlan, map_path, report_of
-
-if TYPE_CHECKING:
-    import trimesh
-
-    from radarsdf.map.view import ViewedMap
 
 
 class TiledMap(TileBlend):
@@ -45,7 +45,7 @@ class TiledMap(TileBlend):
         If the plan is damaged, no tile is done, or a file cannot be read.
     """
 
-    _viewed: "tuple[list[TilePlan], ViewedMap] | None" = None
+    _viewed: tuple[list[TilePlan], ViewedMap] | None = None
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
@@ -55,9 +55,7 @@ class TiledMap(TileBlend):
     def __reduce__(self) -> "tuple[Callable[..., TiledMap], tuple[Any, ...]]":
         return partial(TiledMap, memory_bytes=self.memory_bytes), (str(self.folder),)
 
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> "trimesh.Trimesh":
-        from radarsdf.tiles.mesh import mesh_of  # noqa: PLC0415 - trimesh is slow to import
-
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> Any:
         return mesh_of(self, voxel_size, **wanted)
 
     def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
@@ -88,9 +86,7 @@ class TiledMap(TileBlend):
             found.append(of_tile.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
         return ViewStatisticsAt.together(found)
 
-    def _viewed_from(self, position: Floats, range_m: float) -> "ViewedMap":
-        from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
-
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
         away = np.clip(position[:2], self.corners_m, self.corners_m + self.plan.tile_m) - position[:2]
         near = np.flatnonzero(np.linalg.norm(away, axis=1) <= range_m)
         tiles = [self.tiles[i] for i in near] or self.tiles[:1]  # far from all tiles, any tile shows nothing
@@ -122,9 +118,14 @@ class TiledMap(TileBlend):
         ValueError, MemoryError, OSError
             As for :meth:`mesh`, or if the suffix is unknown, there is no surface, or a file cannot be written.
         """
-        from radarsdf.tiles.mesh import export_mesh  # noqa: PLC0415 - as above
-
-        return export_mesh(self, path, voxel_size, progress, **limits)
+        if path_of(path, "path").suffix.lower() == ".json":
+            return write_tileset(self, Path(path), voxel_size, progress, **limits)
+        checked_suffix(path, MESH_SUFFIXES, "meshes")
+        check_outputs([path])  # before the work
+        mesh = mesh_of(self, voxel_size, progress, **limits)
+        check(len(mesh.faces) != 0, f"{self.folder} has no surface here: nothing written")
+        write_mesh(path, mesh)
+        return len(mesh.vertices), len(mesh.faces)
 
     def threshold(
         self, voxel_size: float = VOXEL_M, *, progress: bool | None = None, **limits: Any
@@ -133,8 +134,6 @@ class TiledMap(TileBlend):
 
         They are computed per tile, without a mesh of the whole map.
         """
-        from radarsdf.tiles.mesh import parts_of  # noqa: PLC0415 - as above
-
         _, wanted, tally = parts_of(self, voxel_size, progress, **limits)
         return tally.threshold(wanted.min_confidence)
 

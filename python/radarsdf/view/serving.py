@@ -37,7 +37,6 @@ _MARGIN = 1.08
 
 
 def require_viser() -> None:
-    """Raise an ImportError with the install command if viser is missing."""
     require("viser", what="the viewer needs")
 
 

@@ -6,16 +6,17 @@ import os
 import shutil
 import subprocess
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 from urllib.parse import quote
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Array, Bytes, Floats
+from radarsdf.checks import restating
 from radarsdf.extras import require
 from radarsdf.grids.grid import Grid
 from radarsdf.io.files import checked_suffix, whole_file
@@ -23,9 +24,6 @@ from radarsdf.io.ros2 import Node, Subscription, encode, make_message
 from radarsdf.render.figures import Scale
 from radarsdf.scans import Scan
 from radarsdf.view.serving import LOCALHOST, free_port
-
-if TYPE_CHECKING:
-    import trimesh
 
 PATH_COLOR, FREE_COLOR = (0, 190, 255), (90, 160, 120)
 # RGBA of free, occupied and unknown voxels.
@@ -44,7 +42,7 @@ class Sink(ABC):
         """Show the returns of a scan, and the pose of its radar."""
 
     @abstractmethod
-    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:
+    def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:
         """Replace the mesh, coloured by its uncertainty, and the sensor positions (F, 3)."""
 
     @abstractmethod
@@ -85,7 +83,7 @@ class FoxgloveSink(Sink):
         rows = np.rec.fromarrays(list(columns.values()), [(name, "<f4") for name in columns])
         self._log_cells(f"/returns/{frame}", of.PointCloud, time_s, rows, frame_id=frame)
 
-    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:
+    def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:
         of, positions = self._of, self._local(path)
         line = {"pose": self._pose(self.origin), "thickness": 3.0, "scale_invariant": True}
         lines = of.LinePrimitive(**line).encode() + _points(5, positions)
@@ -147,7 +145,7 @@ class RerunSink(Sink):
         pose = self._rerun.Transform3D(translation=self._local(T[None, :3, 3])[0], mat3x3=T[:3, :3])
         self._log(time_s, {name: pose, f"{name}/returns": self._rerun.Points3D(scan.points, radii=0.05)})
 
-    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:
+    def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:
         style = {"vertex_normals": mesh.vertex_normals, "vertex_colors": uncertainty_colors(mesh)[0]}
         local = {"vertex_positions": self._local(mesh.vertices), "triangle_indices": mesh.faces}
         line = self._rerun.LineStrips3D([self._local(path)], colors=[PATH_COLOR])
@@ -181,7 +179,7 @@ class Ros2Sink(Sink):
             transforms = [make_message("geometry_msgs/msg/TransformStamped", **one)]
             self._node.publish("/tf", make_message("tf2_msgs/msg/TFMessage", transforms=transforms))
 
-    def show_surface(self, mesh: "trimesh.Trimesh", path: Floats, time_s: float) -> None:  # noqa: ARG002 - poses are published
+    def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:  # noqa: ARG002 - poses are published
         scale, message_type = _geometry("Vector3", np.ones(3)), "visualization_msgs/msg/Marker"
         color = make_message("std_msgs/msg/ColorRGBA", r=0.7, g=0.7, b=0.7, a=1.0)
         # Points are encoded by NumPy, as objects would take a second for 50,000 triangles: one of them marks their place.
@@ -237,7 +235,8 @@ def foxglove_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
         checked_suffix(path, [".mcap"], "Foxglove")
         with whole_file(path) as file, foxglove.open_mcap(file, context=context) as written:
             yield FoxgloveSink(foxglove, context), ""
-            _end(path, written.close)
+            with restating(f"{path} was not written", RuntimeError, kind=OSError):  # such as on a full disk
+                written.close()
         return
     port = free_port(LOCALHOST, None, 8765)
     sink = FoxgloveSink(foxglove, context)
@@ -261,7 +260,8 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
         with whole_file(path) as file, TemporaryDirectory(dir=path.absolute().parent) as folder:
             stream.save(growing := Path(folder) / "growing.rrd")
             yield RerunSink(rerun, stream), ""
-            _end(path, stream.flush)
+            with restating(f"{path} was not written", RuntimeError, kind=OSError):
+                stream.flush()
             stream.disconnect()
             with growing.open("rb") as written:
                 shutil.copyfileobj(written, file)
@@ -282,16 +282,7 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
             server.terminate()
 
 
-def _end(path: Path, last: Callable[[], None]) -> None:
-    """Complete a file. The SDKs raise a RuntimeError if anything was not written, such as on a full disk."""
-    try:
-        last()
-    except RuntimeError as error:
-        msg = f"{path} was not written: {error}"
-        raise OSError(msg) from error
-
-
-def uncertainty_colors(mesh: "trimesh.Trimesh") -> tuple[Bytes, Scale]:
+def uncertainty_colors(mesh: Any) -> tuple[Bytes, Scale]:
     """Return the sRGB colours (V, 3) of the vertices of a mesh by their uncertainty, and their scale, m."""
     uncertainty_m = np.asarray(mesh.vertex_attributes["uncertainty_m"])
     scale = Scale.of(uncertainty_m)

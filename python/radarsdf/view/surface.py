@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -14,15 +14,10 @@ from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check
 from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
+from radarsdf.map.map import Map
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
 from radarsdf.render.figures import SHARES, Scale
-
-if TYPE_CHECKING:
-    import trimesh
-
-    from radarsdf.map.map import Map
-
 
 Position = tuple[float, float, float]
 UNCERTAINTY = "uncertainty (standard error), m"
@@ -53,7 +48,7 @@ class ShownSurface:
     spacing_m: float  # spacing of vertices: the voxel edge, or more if the mesh was thinned
 
     @classmethod
-    def of(cls, radar_map: "Map", voxel_size: float, *, max_vertices: int, **wanted: Any) -> "ShownSurface":
+    def of(cls, radar_map: Map, voxel_size: float, *, max_vertices: int, **wanted: Any) -> "ShownSurface":
         """Mesh a map, and thin the mesh to `max_vertices`. `wanted`: of `Map.mesh`. Raises a ValueError without a surface."""
         mesh: Any = radar_map.mesh(voxel_size, **wanted)
         threshold = Threshold.of_mesh(mesh.metadata)
@@ -92,11 +87,11 @@ def spread_evenly(points: Floats, count: int, edge_m: float) -> tuple[Ints, Ints
     return order[np.cumsum(counts) - counts], of_point, edge_m
 
 
-def thinned(mesh: "trimesh.Trimesh", max_vertices: int, edge_m: float) -> "tuple[trimesh.Trimesh, float]":
+def thinned(mesh: Any, max_vertices: int, edge_m: float) -> tuple[Any, float]:
     """Thin a mesh to `max_vertices`, one with its attributes per cube of a grid; return it and its vertex spacing, m."""
     import trimesh  # noqa: PLC0415 - slow
 
-    vertices: Any = mesh.vertices
+    vertices = mesh.vertices
     rows, of_point, spacing_m = spread_evenly(np.asarray(vertices, np.float64), max_vertices, edge_m)
     if len(rows) == len(vertices):
         return mesh, edge_m
@@ -159,7 +154,7 @@ class Quantity:
     of_sensor: bool = False  # whether it depends on the sensor position
 
 
-def quantities_of(radar_map: "Map", surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
+def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
     """Quantities by name, the default first. The intensity scale is that for the first `sensor` position."""
     vertices, found = surface.vertices, {}
 
