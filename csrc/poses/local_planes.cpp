@@ -12,12 +12,11 @@ namespace {
 constexpr int kAxisBits = 21;  // bits of a key
 constexpr std::int64_t kHalf = std::int64_t{1} << (kAxisBits - 1);
 constexpr std::uint64_t kAxisMask = (std::uint64_t{1} << kAxisBits) - 1;
-constexpr double kQuanta = 1 << 12;  // per cell edge
-constexpr double kWeights[] = {1, 0.7, 0.7 * 0.7,
-                               0.7 * 0.7 * 0.7};  // as for surfels: across a face 0.7, an edge its square
-constexpr double kMinReturns = 8;                 // weighted; the variance of a plane expresses its uncertainty
-constexpr double kMaxFlatness = 0.5;              // as for surfels
-constexpr double kSigmas2 = 4;  // squared scale of the Geman-McClure weight: 1/4 at two standard deviations
+constexpr double kQuanta = 1 << 12;                                  // per cell edge
+constexpr double kWeights[] = {1, 0.7, 0.7 * 0.7, 0.7 * 0.7 * 0.7};  // as for surfels: itself, face, edge, corner
+constexpr double kMinReturns = 8;     // weighted; the variance of a plane expresses its uncertainty
+constexpr double kMaxFlatness = 0.5;  // as for surfels
+constexpr double kSigmas2 = 4;        // squared scale of the Geman-McClure weight: 1/4 at two standard deviations
 constexpr double kMedianOfSquare = 0.4549;
 constexpr double kLeastM2 = 1e-10;  // lower bound of variances, which are divisors
 constexpr int kFirstProduct = 4;

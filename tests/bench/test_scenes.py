@@ -30,11 +30,8 @@ def test_every_nth_subsamples_the_simulation(wall):
     assert_array_equal(third.intensities[1], wall.intensities[3])
     assert_array_equal(third.poses, wall.poses[[0, 3]])
     assert third.ground_truth is wall.ground_truth
-    assert (
-        third.simulation.is_surface().size
-        == len(third.simulation.world_points())
-        == sum(map(len, third.points))
-    )
+    count = sum(map(len, third.points))
+    assert third.simulation.is_surface().size == len(third.simulation.world_points()) == count
     assert_array_equal(third.simulation.noiseless_intensities[1], wall.simulation.noiseless_intensities[3])
 
 

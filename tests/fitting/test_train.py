@@ -96,11 +96,8 @@ def test_joint_iterations_are_spread_over_the_sdf_stage(scene, monkeypatch):
     config = FitConfig(effort=0.2, training={"batch_size": 64, "intensity_batch_size": 64})
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
     done = radar_map.report["iterations_done"]
-    assert (
-        done
-        == radar_map.report["iterations"]
-        == {"sdf": kinds.index("intensity"), "intensity": len(kinds) - kinds.count("sdf")}
-    )
+    counted = {"sdf": kinds.index("intensity"), "intensity": len(kinds) - kinds.count("sdf")}
+    assert done == radar_map.report["iterations"] == counted
     joint = [-1, *(i for i, kind in enumerate(kinds) if kind == "joint")]
     assert (len(joint) - 1, joint[-1] + 1) == (10, done["sdf"])
     assert np.ptp(np.diff(joint)) <= 1

@@ -295,9 +295,8 @@ def test_a_noisy_scan_has_an_unbiased_height(height_m):
     planes, _ = common_planes(returns, poses, 10, 0.4, None, ReturnsConfig(), 1)
     weak = np.tile(np.eye(6), (10, 1, 1))
     moved = planes.solve(weak, np.zeros((9, 6, 6)), np.zeros((10, 6)), 1e-6, 100, False, 1)[0][:, 2]
-    assert (
-        abs(moved[::2].mean() - moved[1::2].mean()) < 0.01
-    )  # 0.02 if returns were assigned to the cell of their position
+    # 0.02 if returns were assigned to the cell of their position.
+    assert abs(moved[::2].mean() - moved[1::2].mean()) < 0.01
 
 
 def test_the_faces_of_a_wall_do_not_attract_each_other():
@@ -322,10 +321,7 @@ def test_fixed_poses_are_kept():
     assert normalised_errors(refined, wall.poses).mean() < 3  # 27 if the others ignore it
     free, none = (radarsdf.refine_poses(wall.points, given, fixed=f) for f in (None, np.zeros(6, bool)))
     np.testing.assert_array_equal(none.covariance, free.covariance)
-
-
-def test_a_fixed_pose_has_no_covariance_even_if_all_are_kept():
-    wall = radarsdf.simulate.wall(frames=6)
+    # A fixed pose has no covariance, even if all are kept.
     kept = radarsdf.refine_poses(wall.points, drifted(wall.poses, 0.1, 0.01, 2), fixed=[True] + 5 * [False])
     assert not kept.improved
     assert np.abs(kept.covariance[0]).max() < 1e-8

@@ -143,10 +143,8 @@ def test_placeholder_values_are_excluded(directions, filler, share):
     filled = [np.where(rng.random(len(v)) < share, filler, v) for v in speeds]
     found, note = without_filler(directions, filled)
     counted = np.mean(np.concatenate(filled) == filler)
-    assert (
-        note
-        == f"{counted:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out"
-    )
+    share = f"{counted:.0%} of the Doppler values are {filler:g} m/s"
+    assert note == f"{share}: they were not measured, and are left out"
     for v, measured, given in zip(found, speeds, filled, strict=True):
         np.testing.assert_array_equal(v, np.where(given == filler, np.nan, measured))
 

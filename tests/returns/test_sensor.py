@@ -143,9 +143,8 @@ def test_variances_of_positions_by_range():
     np.testing.assert_allclose(noise.mean_variances_m2(ranges_m), (0.01 + (0.005 * ranges_m) ** 2) / 3)
     noises = [noise, SensorNoise(0.3, 0.001, 0.002), SensorNoise(0.2, 0.002, 0.009)]
     assert dataclasses.astuple(SensorNoise.median(noises)) == pytest.approx((0.2, 0.002, 0.004))
-    assert (
-        ReturnsConfig(**dict(zip(NOISE_SETTINGS, noise.deviations, strict=True))).elevation_noise_rad == 0.004
-    )
+    config = ReturnsConfig(**dict(zip(NOISE_SETTINGS, noise.deviations, strict=True)))
+    assert config.elevation_noise_rad == 0.004
 
 
 def test_errors_of_poses_are_common_to_the_returns_of_a_scan():
@@ -159,7 +158,5 @@ def test_errors_of_poses_are_common_to_the_returns_of_a_scan():
     np.testing.assert_allclose(found.information, 1 / variances, rtol=1e-6)
     assert returns.with_uncertain_poses(ranges_m, ReturnsConfig()) is returns
     for name in ("pose_sigma_m", "pose_sigma_rad"):
-        assert (
-            returns.with_uncertain_poses(ranges_m, ReturnsConfig(**{name: 0.01})).information
-            < returns.information
-        ).all()
+        found = returns.with_uncertain_poses(ranges_m, ReturnsConfig(**{name: 0.01}))
+        assert (found.information < returns.information).all()
