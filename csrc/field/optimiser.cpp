@@ -14,8 +14,7 @@ void adam_task(const VertexTable& table, const PointBatch<float>& batch, const f
   // Reused between calls: page faults of a new allocation would cost as much as the sums.
   thread_local std::vector<std::int32_t> rows;
   thread_local std::vector<float> sums;  // zero between calls
-  const auto most =
-      static_cast<std::size_t>(std::min(batch.count * corners_per_group(table.encoding()), table.num_rows())) + 1;
+  const std::size_t most = std::min(batch.count * corners_per_group(table.encoding()), table.num_rows()) + 1;
   if (rows.size() < most) rows.resize(most);
   if (sums.size() < most * kFeatureDim) sums.resize(most * kFeatureDim);
   RowSums<float> touched{adam.states, rows.data(), sums.data(), 0};

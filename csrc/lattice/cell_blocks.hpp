@@ -82,7 +82,7 @@ class CellBlocks {
 
  private:
   static const Occupancy* at(const std::vector<Occupancy>& cubes, std::int32_t i) {
-    return i >= 0 ? &cubes[static_cast<std::size_t>(i)] : nullptr;
+    return i >= 0 ? &cubes[i] : nullptr;
   }
 
   std::int64_t size_;

@@ -70,9 +70,7 @@ void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uin
 
 // Uses bits of the hash that FlatMap does not. With the same bits, all keys of a partition would cluster in one part of
 // its slots.
-std::size_t CellSet::partition_of(std::uint64_t block) {
-  return static_cast<std::size_t>((hash_key(block) >> 16) % kPartitions);
-}
+std::size_t CellSet::partition_of(std::uint64_t block) { return (hash_key(block) >> 16) % kPartitions; }
 
 class CellSet::Marks {
  public:
@@ -100,7 +98,7 @@ class CellSet::Marks {
   struct Entry {
     std::uint64_t block, mask;
   };
-  const std::vector<Entry>& of_partition(std::size_t number) const { return of_partitions_[number]; }
+  const std::vector<Entry>& of_partition(std::int64_t number) const { return of_partitions_[number]; }
 
  private:
   std::array<std::vector<Entry>, kPartitions> of_partitions_;
@@ -112,25 +110,24 @@ template <typename Mark>
 void CellSet::insert_marks(std::int64_t count, int num_threads, const Mark& mark) {
   constexpr std::int64_t kAtOnce = 1 << 18;  // bounds the memory for marks
   const std::int64_t num_parts = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
-  std::vector<Marks> parts(static_cast<std::size_t>(num_parts));
+  std::vector<Marks> parts(num_parts);
   for (std::int64_t first = 0; first < count; first += kAtOnce) {
     const std::int64_t size = std::min(kAtOnce, count - first);
     parallel_tasks(num_parts, num_threads, [&](std::int64_t part) {
-      Marks& own = parts[static_cast<std::size_t>(part)];
+      Marks& own = parts[part];
       own.clear();
       mark(first + size * part / num_parts, first + size * (part + 1) / num_parts, own);
       own.finish();
     });
     parallel_tasks(num_parts, num_threads, [&](std::int64_t task) {
       for (std::int64_t p = kPartitions * task / num_parts; p < kPartitions * (task + 1) / num_parts; ++p) {
-        const auto number = static_cast<std::size_t>(p);
-        Partition& own = partitions_[number];
+        Partition& own = partitions_[p];
         for (const Marks& marks : parts) {
-          for (const Marks::Entry& entry : marks.of_partition(number)) {
+          for (const Marks::Entry& entry : marks.of_partition(p)) {
             const auto next = static_cast<std::int32_t>(own.masks.size());
             const std::int32_t found = own.numbers.find_or_insert(entry.block, next);
             if (found == next) own.masks.push_back(0);
-            own.masks[static_cast<std::size_t>(found)] |= entry.mask;
+            own.masks[found] |= entry.mask;
           }
         }
       }
@@ -204,10 +201,10 @@ std::vector<std::uint64_t> CellSet::sorted_keys(int num_threads) const {
   }
   parallel_sort(blocks, num_threads);
   std::vector<std::uint64_t> keys;
-  keys.reserve(static_cast<std::size_t>(size()));
+  keys.reserve(size());
   for (const std::uint64_t block : blocks) {
     const Partition& own = partitions_[partition_of(block)];
-    std::uint64_t mask = own.masks[static_cast<std::size_t>(own.numbers.find(block))];
+    std::uint64_t mask = own.masks[own.numbers.find(block)];
     for (; mask != 0; mask &= mask - 1) {
       keys.push_back(CellBlocks::key_in_block(block, lowest_bit(mask)));
     }

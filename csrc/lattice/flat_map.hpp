@@ -129,10 +129,10 @@ T& value_at(FlatMap& places, std::vector<T>& values, std::vector<std::int32_t>& 
     }
     place = free.back();
     free.pop_back();
-    values[static_cast<std::size_t>(place)] = T{};
+    values[place] = T{};
     places.insert(key, place);
   }
-  return values[static_cast<std::size_t>(place)];
+  return values[place];
 }
 
 }  // namespace radarsdf

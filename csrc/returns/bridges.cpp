@@ -29,7 +29,7 @@ class Neighbourhood {
       : ends_(&ends),
         halo_((reach_cells + kBlockEdge - 1) / kBlockEdge),
         edge_(kBlockEdge + 2 * halo_),
-        there_(static_cast<std::size_t>(edge_ * edge_ * edge_)),
+        there_(edge_ * edge_ * edge_),
         marked_(there_.size()) {}
 
   void move_to(std::uint64_t region_key) {
@@ -80,7 +80,7 @@ class Neighbourhood {
  private:
   std::size_t block_of(const std::int32_t* at) const {
     const auto block = [&](int axis) { return at[axis] >> kBlockBits; };
-    return static_cast<std::size_t>((block(0) * edge_ + block(1)) * edge_ + block(2));
+    return (block(0) * edge_ + block(1)) * edge_ + block(2);
   }
 
   const CellBlocks* ends_;

@@ -69,7 +69,7 @@ Tiles tiles_of(const CellKind& kind, std::size_t kind_number, std::size_t num_ki
 // Numbers the cells of the views from 0 in order of first occurrence, and appends their keys.
 std::int64_t number_cells(const Tiles& tiles, const Views& views, std::int32_t* rows,
                           std::vector<std::uint64_t>* keys) {
-  FlatMap numbers(static_cast<std::size_t>(views.count / kViewsPerCell));
+  FlatMap numbers(views.count / kViewsPerCell);
   std::int32_t next = 0, last = -1;
   std::uint64_t last_key = kEmptyKey;  // that of `last`: views in the order of their places often share large cells
   // With millions of views, almost every look-up is a cache miss: prefetching in batches overlaps them.
@@ -114,7 +114,7 @@ struct Cell {
 
 CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_tilings, const Views& views,
                      const float* values, const float* weights, const CellMeanOptions& options) {
-  const auto count = static_cast<std::size_t>(views.count);
+  const std::size_t count = views.count;
   const int rounds = options.rounds;
   CellMeans result;
   std::vector<std::int32_t> rows(kinds.size() * count);
@@ -133,7 +133,7 @@ CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_til
   std::vector<double> decreases;  // of the means of the last kind
   const std::int32_t* last_row = nullptr;
   const auto update = [&](std::size_t i) {
-    if (last_row != nullptr) left[i] += decreases[static_cast<std::size_t>(last_row[i])];
+    if (last_row != nullptr) left[i] += decreases[last_row[i]];
     return left[i];
   };
   for (int round = 0; round < rounds; ++round) {
@@ -194,19 +194,18 @@ CellMeans fit_cell_means(const std::vector<CellKind>& kinds, int num_tilings, co
                          const float* weights, const CellMeanOptions& options, int num_threads) {
   CellMeans all;
   if (views.count == 0 || kinds.empty()) return all;
-  std::vector<CellMeans> parts(static_cast<std::size_t>(num_tilings));
+  std::vector<CellMeans> parts(num_tilings);
   parallel_tasks(num_tilings, num_threads, [&](std::int64_t t) {
-    parts[static_cast<std::size_t>(t)] =
-        fit_tiling(kinds, static_cast<int>(t), num_tilings, views, values, weights, options);
+    parts[t] = fit_tiling(kinds, static_cast<int>(t), num_tilings, views, values, weights, options);
   });
   std::size_t num_means = 0;
   for (const CellMeans& part : parts) num_means += part.means.size();
   all.keys.reserve(num_means);
   all.means.reserve(num_means);
-  all.explained.reserve(static_cast<std::size_t>(views.count));
+  all.explained.reserve(views.count);
   for (std::int64_t i = 0; i < views.count; ++i) {
     double sum = 0;
-    for (const CellMeans& part : parts) sum += double{part.explained[static_cast<std::size_t>(i)]};
+    for (const CellMeans& part : parts) sum += double{part.explained[i]};
     all.explained.push_back(static_cast<float>(sum / num_tilings));
   }
   for (CellMeans& part : parts) {
@@ -219,10 +218,7 @@ CellMeans fit_cell_means(const std::vector<CellKind>& kinds, int num_tilings, co
 
 CellMeansAt::CellMeansAt(std::vector<CellKind> kinds, int num_tilings, const std::uint64_t* keys, const float* means,
                          std::int64_t count)
-    : kinds_(std::move(kinds)),
-      num_tilings_(num_tilings),
-      means_(means, means + count),
-      rows_(static_cast<std::size_t>(count)) {
+    : kinds_(std::move(kinds)), num_tilings_(num_tilings), means_(means, means + count), rows_(count) {
   for (std::int64_t i = 0; i < count; ++i) {
     if (keys[i] == kEmptyKey || !rows_.insert(keys[i], static_cast<std::int32_t>(i))) {
       throw std::invalid_argument("keys must be different keys of cells");
@@ -243,7 +239,7 @@ void CellMeansAt::sums(const Views& views, float* sums, int num_threads) const {
       double sum = 0;
       for (const Tiles& tile : tiles) {
         const std::int32_t row = rows_.find(tile.key(views, i));
-        if (row >= 0) sum += means_[static_cast<std::size_t>(row)];
+        if (row >= 0) sum += means_[row];
       }
       sums[i] = static_cast<float>(sum / num_tilings_);
     }

@@ -119,7 +119,7 @@ class BlockNeighbourhood {
 class SumsOfBlock {
  public:
   SumsOfBlock(const double* values, int columns, double weight)
-      : values_(values), columns_(columns), weight_(weight), sums_(static_cast<std::size_t>(64 * columns)) {}
+      : values_(values), columns_(columns), weight_(weight), sums_(64 * columns) {}
 
   void move_to(const BlockNeighbourhood& round) {
     std::int64_t first[kWide * kWide * kWide];  // value of each cell that is there

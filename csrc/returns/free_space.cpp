@@ -31,7 +31,7 @@ class Blocks {
       keys.push_back(key);
       blocks.push_back({});
     }
-    return blocks[static_cast<std::size_t>(found)];
+    return blocks[found];
   }
   void clear() {
     rows_.clear();
@@ -178,9 +178,9 @@ FreeSpace find_free_space(const float* points, const float* directions, const fl
   check(rays, leaf_size_m);
   const Walker walker(rays, leaf_size_m, lower, upper);
   const std::int64_t parts = count > (1 << 12) ? resolve_num_threads(num_threads) : 1;
-  std::vector<Blocks<Planes>> of_parts(static_cast<std::size_t>(parts));
+  std::vector<Blocks<Planes>> of_parts(parts);
   parallel_tasks(parts, num_threads, [&](std::int64_t part) {
-    walker.walk(begin_of(rays, part, parts), begin_of(rays, part + 1, parts), of_parts[static_cast<std::size_t>(part)]);
+    walker.walk(begin_of(rays, part, parts), begin_of(rays, part + 1, parts), of_parts[part]);
   });
   Blocks<Planes>& all = of_parts[0];
   for (std::size_t part = 1; part < of_parts.size(); ++part) {

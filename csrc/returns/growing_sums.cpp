@@ -31,17 +31,17 @@ void make_room(std::vector<T>& places, std::size_t more) {
 
 void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
   check_whole_rays(rays.points, rays.directions, rays.ranges_m, rays.count, leaf_size_m_);
-  std::vector<std::uint64_t> keys(static_cast<std::size_t>(rays.count));
+  std::vector<std::uint64_t> keys(rays.count);
   cell_keys(rays.points, rays.count, leaf_size_m_, keys.data(), 1);
   const double quanta = 1 / quantum_m_, quanta_of_cell = std::round(leaf_size_m_ / quantum_m_);
   const std::int64_t scan = ++collected_;
   ReachedCubes reached;
   for (std::int64_t i = 0; i < rays.count; ++i) {
     const float *point = rays.points + 3 * i, *direction = rays.directions + 3 * i;
-    const std::uint64_t key = keys[static_cast<std::size_t>(i)];
+    const std::uint64_t key = keys[i];
     const auto next = static_cast<std::int32_t>(cells_.size());
     if (number_of_cell_.insert(key, next)) cells_.push_back({key, {}, 0, 0});
-    Cell& cell = cells_[static_cast<std::size_t>(number_of_cell_.find(key))];
+    Cell& cell = cells_[number_of_cell_.find(key)];
     std::int64_t corner[3];
     for (int axis = 0; axis < 3; ++axis) {
       const auto at = static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias;
@@ -64,7 +64,7 @@ void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
       const std::uint64_t cube = CellBlocks::key_in_block(block_key, lowest_bit(mask));
       const auto number = static_cast<std::int32_t>(visibility_.size());
       if (number_of_cube_.insert(cube, number)) visibility_.push_back({cube, 0});
-      visibility_[static_cast<std::size_t>(number_of_cube_.find(cube))].visibility += sign;
+      visibility_[number_of_cube_.find(cube)].visibility += sign;
     }
   });
 }
@@ -83,7 +83,7 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
   std::int64_t new_cells = 0, new_blocks = 0;
   for (const SumsChange::Cell& cell : change.cells_) {
     const std::int32_t place = number_of_cell_.find(cell.key);
-    const Cell there = place < 0 ? Cell{} : cells_[static_cast<std::size_t>(place)];
+    const Cell there = place < 0 ? Cell{} : cells_[place];
     const std::int64_t scans = there.scans + cell.scans;
     if (there.sums[0] + cell.sums[0] < 0 || scans < 0) throw std::invalid_argument(kNeverAdded);
     if (scans > std::numeric_limits<std::uint32_t>::max()) throw std::invalid_argument("too many scans");
@@ -92,7 +92,7 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
   }
   for (const SumsChange::Visibility& visibility : change.visibility_) {
     const std::int32_t place = number_of_block_.find(visibility.key);
-    const std::int64_t there = place < 0 ? 0 : blocks_[static_cast<std::size_t>(place)].visibility;
+    const std::int64_t there = place < 0 ? 0 : blocks_[place].visibility;
     if (there + visibility.visibility < 0) throw std::invalid_argument(kNeverAdded);
     new_blocks += place < 0 ? 1 : 0;
   }
@@ -151,8 +151,8 @@ SumsOfCells GrowingSums::sums_of(const std::uint64_t* block_keys, std::int64_t c
   for (std::int64_t i = 0; i < count; ++i) {
     const std::int32_t place = number_of_block_.find(block_keys[i]);
     if (place < 0) continue;
-    for_each_cell(block_keys[i], blocks_[static_cast<std::size_t>(place)], [&](std::uint64_t key) {
-      const Cell& cell = cells_[static_cast<std::size_t>(number_of_cell_.find(key))];
+    for_each_cell(block_keys[i], blocks_[place], [&](std::uint64_t key) {
+      const Cell& cell = cells_[number_of_cell_.find(key)];
       found.keys.push_back(key);
       found.sums.insert(found.sums.end(), cell.sums, cell.sums + kSums);
       found.scans.push_back(cell.scans);
@@ -167,7 +167,7 @@ VisibilityOfBlocks GrowingSums::visibility_of(const std::uint64_t* block_keys, s
     const std::int32_t place = number_of_block_.find(block_keys[i]);
     if (place < 0) continue;
     found.keys.push_back(block_keys[i]);
-    found.visibility.push_back(blocks_[static_cast<std::size_t>(place)].visibility);
+    found.visibility.push_back(blocks_[place].visibility);
   }
   return found;
 }
@@ -199,7 +199,7 @@ void GrowingSums::erase(const std::uint64_t* block_keys, std::int64_t count) {
   for (std::int64_t i = 0; i < count; ++i) {
     const std::int32_t place = number_of_block_.find(block_keys[i]);
     if (place < 0) continue;
-    Block& block = blocks_[static_cast<std::size_t>(place)];
+    Block& block = blocks_[place];
     for_each_cell(block_keys[i], Block{block}, [&](std::uint64_t key) { drop_cell(key, block); });
     block.visibility = 0;
     drop_if_empty(block_keys[i]);
@@ -231,7 +231,7 @@ void GrowingSums::drop_cell(std::uint64_t key, Block& block) {
 
 void GrowingSums::drop_if_empty(std::uint64_t block_key) {
   const std::int32_t place = number_of_block_.find(block_key);
-  if (place < 0 || !blocks_[static_cast<std::size_t>(place)].is_empty()) return;
+  if (place < 0 || !blocks_[place].is_empty()) return;
   free_blocks_.push_back(place);
   number_of_block_.erase(block_key);
 }

@@ -48,8 +48,8 @@ struct Line {
         const int k = static_cast<int>(place);  // 0 from -1 on
         return static_cast<std::size_t>(k > kLast ? kLast : k < 0 ? 0 : k);
       };
-      cells &= kSlabs[static_cast<std::size_t>(axis)][cell((begin < end ? begin : end) - kRounding)]
-                     [cell((begin < end ? end : begin) + kRounding)];
+      cells &=
+          kSlabs[axis][cell((begin < end ? begin : end) - kRounding)][cell((begin < end ? end : begin) + kRounding)];
     }
     return cells;
   }
@@ -139,7 +139,7 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
             const std::int32_t row = rows.row(cell.key());
             on_end = row < 0 ? on_end + 1 : 0;
             if (on_end > kEmptyCells) break;
-            if (row >= 0 && crosses(i, surfels_[static_cast<std::size_t>(row)], begin_m, end_m)) {
+            if (row >= 0 && crosses(i, surfels_[row], begin_m, end_m)) {
               crossed[i] = row;
               break;
             }

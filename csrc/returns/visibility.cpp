@@ -21,15 +21,15 @@ template <typename Count>
 std::vector<std::uint32_t> count_by_scans(const std::int32_t* scans, std::int64_t size, std::int64_t places,
                                           int num_threads, const Count& count) {
   const std::int64_t parts = size > (1 << 14) ? resolve_num_threads(num_threads) : 1;
-  std::vector<std::vector<std::uint32_t>> counts(static_cast<std::size_t>(parts));
+  std::vector<std::vector<std::uint32_t>> counts(parts);
   const auto begin_of = [&](std::int64_t part) {
     const std::int64_t near = size * part / parts;
     if (near == 0 || near == size) return near;
     return static_cast<std::int64_t>(std::lower_bound(scans, scans + size, scans[near]) - scans);
   };
   parallel_tasks(parts, num_threads, [&](std::int64_t part) {
-    std::vector<std::uint32_t>& own = counts[static_cast<std::size_t>(part)];
-    own.resize(static_cast<std::size_t>(places));
+    std::vector<std::uint32_t>& own = counts[part];
+    own.resize(places);
     count(begin_of(part), begin_of(part + 1), own);
   });
   for (std::size_t part = 1; part < counts.size(); ++part) {
@@ -49,7 +49,7 @@ void check_scans(const std::int32_t* scans, std::int64_t count) {
 ReachedCubes::Block& ReachedCubes::block_at(std::uint64_t key) {
   const auto next = static_cast<std::int32_t>(blocks_.size()), found = numbers_.find_or_insert(key, next);
   if (found == next) blocks_.push_back({key, 0});
-  return blocks_[static_cast<std::size_t>(found)];
+  return blocks_[found];
 }
 
 void ReachedCubes::trace(const float* point, const float* direction, double range_m, double leaf_size_m) {
@@ -100,7 +100,7 @@ void count_visibility(const std::uint64_t* leaf_keys, std::int64_t num_leaves, d
       reached.for_each_block([&](std::uint64_t block_key, std::uint64_t mask) {
         const Occupancy& block = near.block(block_key);
         for (mask &= block.mask; mask != 0; mask &= mask - 1)
-          ++counts[static_cast<std::size_t>(block.row(static_cast<std::uint64_t>(lowest_bit(mask))))];
+          ++counts[block.row(static_cast<std::uint64_t>(lowest_bit(mask)))];
       });
       reached.clear();
     }
@@ -119,7 +119,7 @@ void count_scans(const std::int32_t* cells, const std::int32_t* scans, std::int6
   const auto of_returns = [&](std::int64_t begin, std::int64_t end, std::vector<std::uint32_t>& counts) {
     std::vector<std::int32_t> last_scan(counts.size(), -1);  // last scan counted in each cell
     for (std::int64_t i = begin; i < end; ++i) {
-      const auto cell = static_cast<std::size_t>(cells[i]);
+      const std::int32_t cell = cells[i];
       counts[cell] += last_scan[cell] != scans[i] ? 1 : 0;
       last_scan[cell] = scans[i];
     }

@@ -32,7 +32,7 @@ inline void ask_for_huge_pages([[maybe_unused]] void* memory, [[maybe_unused]] s
 template <typename T>
 std::unique_ptr<T[]> large_array(std::int64_t size) {
   std::unique_ptr<T[]> array(new T[size]);
-  ask_for_huge_pages(array.get(), sizeof(T) * static_cast<std::size_t>(size));
+  ask_for_huge_pages(array.get(), sizeof(T) * size);
   return array;
 }
 

@@ -19,7 +19,7 @@ inline std::uint64_t random_word(std::uint64_t seed, std::uint64_t index) {
 class RandomRows {
  public:
   RandomRows(std::uint64_t seed, std::int64_t columns)
-      : seed_(seed), words_(static_cast<std::size_t>((columns + 7) / 8)), bytes_(8 * words_.size()) {}
+      : seed_(seed), words_((columns + 7) / 8), bytes_(8 * words_.size()) {}
 
   // Valid until the next call.
   const std::uint8_t* row(std::int64_t i) {

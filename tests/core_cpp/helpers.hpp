@@ -14,7 +14,7 @@ template <typename T>
 std::vector<T> normal_numbers(std::int64_t size, double scale, unsigned seed) {
   std::mt19937 generator(seed);
   std::normal_distribution<double> normal(0.0, scale);
-  std::vector<T> numbers(static_cast<std::size_t>(size));
+  std::vector<T> numbers(size);
   for (T& number : numbers) number = static_cast<T>(normal(generator));
   return numbers;
 }

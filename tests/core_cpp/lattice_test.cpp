@@ -43,7 +43,7 @@ TEST_CASE("a Morton key decodes to its coordinates, and shifted to those of its 
     const std::uint64_t key = radarsdf::morton_key(c[0], c[1], c[2]);
     REQUIRE((key >> 63) == 0);
     for (int axis = 0; axis < 3; ++axis) {
-      REQUIRE(radarsdf::morton_coordinate(key, axis) == c[static_cast<std::size_t>(axis)]);
+      REQUIRE(radarsdf::morton_coordinate(key, axis) == c[axis]);
     }
     REQUIRE((key >> 3) == radarsdf::morton_key(c[0] >> 1, c[1] >> 1, c[2] >> 1));
     REQUIRE((key & 7) == ((c[0] & 1) | (c[1] & 1) << 1 | (c[2] & 1) << 2));
@@ -94,7 +94,7 @@ TEST_CASE("the table numbers the vertices of each level and group in Morton orde
       std::set<std::uint64_t> keys = set;
       for (int level = 0; level < kLevels; ++level) {
         for (int group = 0; group < groups; ++group) {
-          const auto& used = axes[static_cast<std::size_t>(group)];
+          const auto& used = axes[group];
           // Coordinates of a vertex along the axes used by the group.
           const auto vertex = [&](std::uint64_t key, int corner) {
             std::uint32_t at[3] = {};

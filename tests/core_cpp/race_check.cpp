@@ -136,7 +136,7 @@ void networks(int threads, Results& results) {
       {second.data(), second.data() + kOutputs * kHidden, kHidden, kOutputs}};
   const std::vector<radarsdf::Columns<const T>> inputs = {{wide.data(), kWide, kWide},
                                                           {narrow.data(), kNarrow, kNarrow}};
-  std::vector<T> hidden(static_cast<std::size_t>(radarsdf::mlp_hidden_columns(layers) * kPoints));
+  std::vector<T> hidden(radarsdf::mlp_hidden_columns(layers) * kPoints);
   std::vector<T> out(grad.size()), first_grad(first.size()), second_grad(second.size()), wide_grad(wide.size());
   radarsdf::mlp(radarsdf::ForwardWeights<T>(layers), inputs, kPoints, hidden.data(), out.data(), threads);
   const radarsdf::BackwardWeights<T> backward(layers, {{kWide, true}, {kNarrow, false}});
@@ -171,7 +171,7 @@ void sums_and_rays(int threads, Results& results) {
   blocks.rows(keys.data(), kPoints, rows.data(), threads);
   results.add(rows.data(), kPoints);
   const std::vector<float> ranges(kPoints, 6.0F);
-  std::vector<std::int64_t> sums(static_cast<std::size_t>(radarsdf::kSums * num_cells));
+  std::vector<std::int64_t> sums(radarsdf::kSums * num_cells);
   radarsdf::sum_returns({points.data(), directions.data(), ranges.data(), rows.data(), kPoints}, sorted.data(),
                         num_cells, 0.4, sums.data(), threads);
   const std::vector<double> values(sums.begin(), sums.end());
@@ -184,7 +184,7 @@ void sums_and_rays(int threads, Results& results) {
   std::vector<radarsdf::Surfel> surfels;
   for (std::int64_t cell = 0; cell < num_cells; ++cell) {
     const double* m = values.data() + radarsdf::kSums * cell;
-    const std::uint64_t key = sorted[static_cast<std::size_t>(cell)];
+    const std::uint64_t key = sorted[cell];
     const auto mean = [&](int axis) {
       const double in_cell = m[1 + axis] / (m[0] * static_cast<double>(radarsdf::kQuanta));
       return static_cast<float>(0.4 * (radarsdf::morton_coordinate(key, axis) + in_cell - radarsdf::kAxisBias));
@@ -278,8 +278,8 @@ void before_the_training(int threads, Results& results) {
   const std::vector<float> ranges(kPoints, 6.0F);
   std::vector<std::int32_t> scans(kPoints), of_return(kPoints);
   for (std::int32_t i = 0; i < kPoints; ++i) {
-    scans[static_cast<std::size_t>(i)] = static_cast<std::int32_t>(i * kScans / kPoints);
-    of_return[static_cast<std::size_t>(i)] = static_cast<std::int32_t>(i % (kPlanes + 1) - 1);
+    scans[i] = static_cast<std::int32_t>(i * kScans / kPoints);
+    of_return[i] = static_cast<std::int32_t>(i % (kPlanes + 1) - 1);
   }
   std::vector<float> moved(7 * kPoints);
   radarsdf::move_onto_planes({points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), nullptr,
@@ -309,7 +309,7 @@ void surfaces(int threads, Results& results) {
   auto volume = test::normal_numbers<T>(size, 1.0, 5);
   const auto chosen = test::normal_numbers<float>(size, 1.0, 6);
   const auto mask = std::make_unique<bool[]>(static_cast<std::size_t>(size));
-  for (std::int64_t i = 0; i < size; ++i) mask[static_cast<std::size_t>(i)] = chosen[static_cast<std::size_t>(i)] > -2;
+  for (std::int64_t i = 0; i < size; ++i) mask[i] = chosen[i] > -2;
   volume[1000] = static_cast<T>(NAN);
   const radarsdf::Lattice lattice;
   results.add(radarsdf::marching_cubes_dense(volume.data(), shape, nullptr, lattice, 0.1, threads));

@@ -35,7 +35,7 @@ TEST_CASE("bit counts and positions equal those of std::bitset") {
 TEST_CASE("each task runs once") {
   for (const int threads : test::kThreads) {
     std::vector<std::atomic<int>> runs(1000);
-    radarsdf::parallel_tasks(1000, threads, [&](std::int64_t i) { ++runs[static_cast<std::size_t>(i)]; });
+    radarsdf::parallel_tasks(1000, threads, [&](std::int64_t i) { ++runs[i]; });
     CHECK(std::all_of(runs.begin(), runs.end(), [](const std::atomic<int>& n) { return n == 1; }));
     radarsdf::parallel_tasks(0, threads, [](std::int64_t) { FAIL("there is no task"); });
   }
@@ -47,7 +47,7 @@ TEST_CASE("a thread pool runs each task once, in consecutive jobs") {
     std::vector<std::atomic<int>> runs(50);
     for (int job = 1; job <= 300; ++job) {
       const std::int64_t tasks = job % 51;
-      pool.begin(tasks, [&](std::int64_t i) { ++runs[static_cast<std::size_t>(i)]; });
+      pool.begin(tasks, [&](std::int64_t i) { ++runs[i]; });
       // In some jobs, the other threads are asleep.
       if (job % 100 == 0) std::this_thread::sleep_for(std::chrono::milliseconds(20));
       pool.finish();
@@ -120,10 +120,10 @@ TEST_CASE("random words equal SplitMix64, with a sequence for each row") {
 TEST_CASE("blocks partition a range and have bounded size") {
   for (const int threads : test::kThreads) {
     for (const std::int64_t size : {0, 1, 511, 512, 100000, 1 << 20}) {
-      std::vector<std::atomic<int>> visits(static_cast<std::size_t>(size));
+      std::vector<std::atomic<int>> visits(size);
       std::atomic<std::int64_t> longest{0};
       radarsdf::parallel_blocks(size, 512, threads, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t i = begin; i < end; ++i) ++visits[static_cast<std::size_t>(i)];
+        for (std::int64_t i = begin; i < end; ++i) ++visits[i];
         std::int64_t known = longest;
         while (known < end - begin && !longest.compare_exchange_weak(known, end - begin)) {
         }
