@@ -159,6 +159,10 @@ BlockBand BlockBand::inverse() const {
     for (std::int64_t k = j + 1; k <= last; ++k) {
       subtract_times<true>(&y[kBlock * (k - j)], z.block(k, j), diagonal);
     }
+    // Symmetric errors stay small, while antisymmetric ones grow with the squares of Y.
+    for (int a = 0; a < kPose; ++a) {
+      for (int b = 0; b < a; ++b) diagonal[kPose * a + b] = diagonal[kPose * b + a];
+    }
   }
   return z;
 }
