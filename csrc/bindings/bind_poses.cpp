@@ -117,11 +117,11 @@ void bind_poses(py::module_& m) {
           "6) of a matrix whose square is subtracted, with the scan (C,) of each and the first (P + 1,) of each plane.")
       .def(
           "solve",
-          [](const CommonPlanes& planes, const Array<double>& diagonal, const Array<double>& below,
-             const Array<double>& gradient, double tolerance, int max_iterations, bool with_inverse, int num_threads) {
+          [](const CommonPlanes& planes, const Array<double>& prior, const Array<double>& gradient, double tolerance,
+             int max_iterations, bool with_inverse, int num_threads) {
             const auto count = static_cast<std::int64_t>(planes.weights().size());
-            check_shape(diagonal, {count, kPose, kPose}, "diagonal");
-            check_shape(below, {count - 1, kPose, kPose}, "below");
+            const std::int64_t blocks = prior.ndim() == 4 ? std::clamp<std::int64_t>(prior.shape(1), 1, count) : 1;
+            check_shape(prior, {count, blocks, kPose, kPose}, "prior");
             check_shape(gradient, {count, kPose}, "gradient");
             Array<double> x = new_array<double>(count, kPose);
             Array<double> inverse = new_array<double>(with_inverse ? count : 0, kPose, kPose),
@@ -129,17 +129,16 @@ void bind_poses(py::module_& m) {
             double *id = with_inverse ? inverse.mutable_data() : nullptr,
                    *ib = with_inverse ? inverse_below.mutable_data() : nullptr;
             const double decrement = without_gil([&] {
-              return planes.solve(diagonal.data(), below.data(), gradient.data(), tolerance, max_iterations,
-                                  x.mutable_data(), id, ib, num_threads);
+              return planes.solve(BlockBand(count, blocks - 1, prior.data()), gradient.data(), tolerance,
+                                  max_iterations, x.mutable_data(), id, ib, num_threads);
             });
             return py::make_tuple(x, inverse, inverse_below, decrement);
           },
-          "diagonal"_array, "below"_array, "gradient"_array, "tolerance"_a, "max_iterations"_a, "with_inverse"_a,
-          "num_threads"_a = 0,
+          "prior"_array, "gradient"_array, "tolerance"_a, "max_iterations"_a, "with_inverse"_a, "num_threads"_a = 0,
           "Increments (F, 6) of the poses: translation, and rotation vector applied from the left about the sensor; "
           "blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), `with_inverse`; squared "
-          "Mahalanobis norm of the increments. The prior is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, "
-          "6, 6), `gradient` (F, 6), all float64.");
+          "Mahalanobis norm of the increments. `prior` (F, W, 6, 6): of each row of its band, the blocks up to the "
+          "diagonal; `gradient` (F, 6) of the prior.");
 }
 
 }  // namespace radarsdf

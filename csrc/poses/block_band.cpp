@@ -74,10 +74,12 @@ void divide_by(double* a, const double* l) {
 
 }  // namespace
 
-BlockBand::BlockBand(std::int64_t rows, std::int64_t width)
+BlockBand::BlockBand(std::int64_t rows, std::int64_t width, const double* blocks)
     : rows_(rows),
       width_(std::clamp<std::int64_t>(width, 0, std::max<std::int64_t>(rows - 1, 0))),
-      blocks_(static_cast<std::size_t>(kBlock * rows_ * (width_ + 1))) {}
+      blocks_(static_cast<std::size_t>(kBlock * rows_ * (width_ + 1))) {
+  if (blocks != nullptr) std::copy(blocks, blocks + blocks_.size(), blocks_.begin());
+}
 
 bool BlockBand::factor() {
   for (std::int64_t i = 0; i < rows_; ++i) {
@@ -158,6 +160,10 @@ BlockBand BlockBand::inverse() const {
     divide_by(diagonal, block(j, j));
     for (std::int64_t k = j + 1; k <= last; ++k) {
       subtract_times<true>(&y[kBlock * (k - j)], z.block(k, j), diagonal);
+    }
+    // Symmetric errors stay small, while antisymmetric ones grow with the squares of Y.
+    for (int a = 0; a < kPose; ++a) {
+      for (int b = 0; b < a; ++b) diagonal[kPose * a + b] = diagonal[kPose * b + a];
     }
   }
   return z;

@@ -13,10 +13,9 @@ constexpr int kBlock = kPose * kPose;
 // Lower triangle; blocks in C order.
 class BlockBand {
  public:
-  // `rows` rows of blocks, each with up to `width` blocks left of the diagonal.
-  BlockBand(std::int64_t rows, std::int64_t width);
+  // `rows` rows of up to `width` blocks left of the diagonal, and that on it: (rows, width + 1, 6, 6); null: 0.
+  BlockBand(std::int64_t rows, std::int64_t width, const double* blocks = nullptr);
 
-  std::int64_t rows() const { return rows_; }
   std::int64_t width() const { return width_; }
 
   // Block in this row and column, row - width <= column <= row.

@@ -285,8 +285,7 @@ void CommonPlanes::subtract_planes(BlockBand& band, int num_threads) const {
   });
 }
 
-void CommonPlanes::apply(const double* diagonal, const double* below, const double* x, double* y,
-                         int num_threads) const {
+void CommonPlanes::apply(const BlockBand& prior, const double* x, double* y, int num_threads) const {
   const std::size_t planes = first_of_plane_.size() - 1;
   std::vector<double> of_plane(kPlane * planes);
   parallel_for(static_cast<std::int64_t>(planes), 1 << 8, num_threads, [&](std::int64_t p) {
@@ -300,9 +299,10 @@ void CommonPlanes::apply(const double* diagonal, const double* below, const doub
     double* out = y + kPose * s;
     std::fill(out, out + kPose, 0.0);
     add_product<kPose>(&diagonal_[kBlock * s], x + kPose * s, out);
-    add_product<kPose>(diagonal + kBlock * s, x + kPose * s, out);
-    if (s > 0) add_product<kPose>(below + kBlock * (s - 1), x + kPose * (s - 1), out);
-    if (s + 1 < num_scans_) add_transposed_product<kPose>(below + kBlock * s, x + kPose * (s + 1), out);
+    for (std::int64_t t = prior.first_column(s); t <= s; ++t) add_product<kPose>(prior.block(s, t), x + kPose * t, out);
+    for (std::int64_t t = s + 1; t < num_scans_ && prior.first_column(t) <= s; ++t) {
+      add_transposed_product<kPose>(prior.block(t, s), x + kPose * t, out);
+    }
     for (std::int64_t k = first_of_scan_[s]; k < first_of_scan_[s + 1]; ++k) {
       const std::size_t cluster = order_[k];
       const double *c = &coupling_[kCoupling * cluster],
@@ -314,15 +314,12 @@ void CommonPlanes::apply(const double* diagonal, const double* below, const doub
   });
 }
 
-double CommonPlanes::solve(const double* diagonal, const double* below, const double* q, double tolerance,
-                           int max_iterations, double* x, double* inverse_diagonal, double* inverse_below,
-                           int num_threads) const {
-  BlockBand band(num_scans_, std::max<std::int64_t>(width_, 1));
+double CommonPlanes::solve(const BlockBand& prior, const double* q, double tolerance, int max_iterations, double* x,
+                           double* inverse_diagonal, double* inverse_below, int num_threads) const {
+  BlockBand band(num_scans_, std::max({width_, prior.width(), std::int64_t{1}}));
   for (std::int64_t s = 0; s < num_scans_; ++s) {
-    for (int k = 0; k < kBlock; ++k) {
-      band.block(s, s)[k] = diagonal_[kBlock * s + k] + diagonal[kBlock * s + k];
-      if (s > 0) band.block(s, s - 1)[k] = below[kBlock * (s - 1) + k];
-    }
+    std::copy(prior.block(s, prior.first_column(s)), prior.block(s, s) + kBlock, band.block(s, prior.first_column(s)));
+    for (int k = 0; k < kBlock; ++k) band.block(s, s)[k] += diagonal_[kBlock * s + k];
   }
   subtract_planes(band, num_threads);
   if (!band.factor()) throw std::runtime_error("the poses are not determined: their prior must be positive definite");
@@ -345,7 +342,7 @@ double CommonPlanes::solve(const double* diagonal, const double* below, const do
   int iterations = 0;
   while (iterations < max_iterations && energy > enough && energy > 0) {
     check_interrupt();
-    apply(diagonal, below, direction.data(), product.data(), num_threads);
+    apply(prior, direction.data(), product.data(), num_threads);
     const double curvature = std::inner_product(direction.begin(), direction.end(), product.begin(), 0.0);
     if (!(curvature > 0)) break;
     const double step = energy / curvature;

@@ -51,13 +51,12 @@ class CommonPlanes {
   const std::vector<std::int32_t>& scan_of_cluster() const { return scan_of_cluster_; }
   const std::vector<std::int64_t>& first_of_plane() const { return first_of_plane_; }
 
-  // Solves (H + P) x = -(g + q) for the increments x (scans, 6): H and g are of the planes; P (prior) is block
-  // tridiagonal, diagonal (scans, 6, 6), below (scans - 1, 6, 6), and q (scans, 6) its gradient. By conjugate
-  // gradients, preconditioned by a band Cholesky factor, which is exact unless distant scans share a plane. If given,
-  // `inverse_diagonal` (scans, 6, 6) and `inverse_below` (scans - 1, 6, 6) receive blocks of the inverse of that band,
-  // an upper bound of the covariance. Returns -(g + q) x, the squared norm of x in standard deviations.
-  double solve(const double* diagonal, const double* below, const double* q, double tolerance, int max_iterations,
-               double* x, double* inverse_diagonal, double* inverse_below, int num_threads) const;
+  // Solves (H + P) x = -(g + q) for the increments x (scans, 6): H and g are of the planes, P and q (scans, 6) of the
+  // prior. By conjugate gradients, preconditioned by a band Cholesky factor, which is exact unless distant scans share
+  // a plane. If given, `inverse_diagonal` (scans, 6, 6) and `inverse_below` (scans - 1, 6, 6) receive blocks of the
+  // inverse of that band, an upper bound of the covariance. Returns -(g + q) x, squared standard deviations of x.
+  double solve(const BlockBand& prior, const double* q, double tolerance, int max_iterations, double* x,
+               double* inverse_diagonal, double* inverse_below, int num_threads) const;
 
  private:
   struct Input;  // arguments and intermediate results of the constructor
@@ -67,7 +66,7 @@ class CommonPlanes {
   void eliminate_planes(Input& input, int num_threads);
   void eliminate_plane(Input& input, std::int64_t plane);
   void sum_scans(const Input& input, int num_threads);
-  void apply(const double* diagonal, const double* below, const double* x, double* y, int num_threads) const;
+  void apply(const BlockBand& prior, const double* x, double* y, int num_threads) const;
   void subtract_planes(BlockBand& band, int num_threads) const;
 
   std::int64_t num_scans_, width_;

@@ -704,8 +704,7 @@ class CommonPlanes:
         """
     def solve(
         self,
-        diagonal: numpy.typing.NDArray[numpy.float64],
-        below: numpy.typing.NDArray[numpy.float64],
+        prior: numpy.typing.NDArray[numpy.float64],
         gradient: numpy.typing.NDArray[numpy.float64],
         tolerance: typing.SupportsFloat | typing.SupportsIndex,
         max_iterations: typing.SupportsInt | typing.SupportsIndex,
@@ -718,7 +717,7 @@ class CommonPlanes:
         float,
     ]:
         """
-        Increments (F, 6) of the poses: translation, and rotation vector applied from the left about the sensor; blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), `with_inverse`; squared Mahalanobis norm of the increments. The prior is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, 6, 6), `gradient` (F, 6), all float64.
+        Increments (F, 6) of the poses: translation, and rotation vector applied from the left about the sensor; blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), `with_inverse`; squared Mahalanobis norm of the increments. `prior` (F, W, 6, 6): of each row of its band, the blocks up to the diagonal; `gradient` (F, 6) of the prior.
         """
     @property
     def equations(

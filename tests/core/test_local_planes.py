@@ -140,17 +140,16 @@ def dense(given, scale):
     return a - taken @ b.T, g[: 6 * SCANS] - taken @ g[6 * SCANS :]
 
 
-def prior(rng):
-    """Block tridiagonal: diagonal, below, gradient, and as one matrix."""
-    diagonal = np.tile(30 * np.eye(6), (SCANS, 1, 1))
-    below = rng.normal(0, 1, (SCANS - 1, 6, 6))
-    whole = np.zeros((6 * SCANS, 6 * SCANS))
+def prior(rng, width=3):
+    """Band of a prior, its gradient, and the band as one matrix."""
+    band = rng.normal(0, 1, (SCANS, width, 6, 6))
+    band[:, -1] = 30 * np.eye(6)
+    whole = np.zeros((SCANS, 6, SCANS, 6))
     for s in range(SCANS):
-        whole[6 * s : 6 * s + 6, 6 * s : 6 * s + 6] = diagonal[s]
-        if s:
-            whole[6 * s : 6 * s + 6, 6 * s - 6 : 6 * s] = below[s - 1]
-            whole[6 * s - 6 : 6 * s, 6 * s : 6 * s + 6] = below[s - 1].T
-    return diagonal, below, rng.normal(0, 1, (SCANS, 6)), whole
+        for other in range(max(0, s - width + 1), s + 1):
+            block = band[s, other - s + width - 1]
+            whole[s, :, other], whole[other, :, s] = block, block.T
+    return band, rng.normal(0, 1, (SCANS, 6)), whole.reshape(6 * SCANS, 6 * SCANS)
 
 
 @pytest.mark.parametrize("together", [1, 2, 4, SCANS])
@@ -167,8 +166,8 @@ def test_increments_equal_the_dense_solution(together):
         block_diag(*diagonal.reshape(-1, 6, 6)) - C.T @ C, H, atol=1e-5 * np.abs(H).max()
     )
     np.testing.assert_allclose(gradient, g, atol=1e-5 * np.abs(g).max())
-    diagonal, below, gradient, whole = prior(np.random.default_rng(1))
-    x, inverse, inverse_below, decrement = found.solve(diagonal, below, gradient, 1e-10, 200, True, 2)
+    band, gradient, whole = prior(np.random.default_rng(1))
+    x, inverse, inverse_below, decrement = found.solve(band, gradient, 1e-10, 200, True, 2)
     expected = -np.linalg.solve(H + whole, g + gradient.reshape(-1))
     np.testing.assert_allclose(x.reshape(-1), expected, atol=2e-5 * np.abs(expected).max())
     assert decrement == pytest.approx(-(g + gradient.reshape(-1)) @ expected, rel=1e-4)
@@ -180,6 +179,24 @@ def test_increments_equal_the_dense_solution(together):
                 np.testing.assert_allclose(inverse_below[s - 1], C[s, :, s - 1], atol=2e-5 * np.abs(C).max())
         else:  # the band has less information
             assert np.linalg.eigvalsh(inverse[s] - C[s, :, s]).min() > -1e-6 * np.abs(C).max()
+
+
+def test_the_inverse_is_accurate_along_a_chain_of_unequal_steps():
+    """Regression: its errors grew tenfold from scan to scan."""
+    count, spread = 60, np.random.default_rng(1).normal(size=(6, 6))
+    shares = np.tile([0.1, 10.0], count)[
+        : count - 2, None
+    ]  # of the duration of a step to that of the one before
+    eye, spread = np.eye(count), spread @ spread.T + np.eye(6)
+    rows = eye[2:] - (1 + shares) * eye[1:-1] + shares * eye[:-2]
+    chain = 1e4 * rows.T @ rows + eye
+    band = np.stack([np.pad(np.diag(chain, -lag), (lag, 0)) for lag in (2, 1, 0)], 1)
+    given = [part[:0] for part in returns()]
+    given[5:7] = np.zeros((2, count, 3))
+    planes = CommonPlanes(*given, EXTENT_M, np.ones((count, 3)), 3)
+    inverse = planes.solve(band[:, :, None, None] * spread, np.zeros((count, 6)), 1e-6, 50, True)[1]
+    expected = np.linalg.inv(chain).diagonal()[:, None, None] * np.linalg.inv(spread)
+    np.testing.assert_allclose(inverse, expected, atol=1e-6 * expected.max())
 
 
 def test_the_scale_is_the_median_squared_residual():
@@ -198,11 +215,9 @@ def test_the_scale_is_the_median_squared_residual():
 
 def test_results_do_not_depend_on_threads():
     given = returns(3, 40_000)
-    diagonal, below, gradient, _ = prior(np.random.default_rng(1))
+    band, gradient, _ = prior(np.random.default_rng(1))
     answers = [
-        CommonPlanes(*given, EXTENT_M, SPREAD, 3, threads).solve(
-            diagonal, below, gradient, 1e-6, 50, True, threads
-        )
+        CommonPlanes(*given, EXTENT_M, SPREAD, 3, threads).solve(band, gradient, 1e-6, 50, True, threads)
         for threads in (1, 2, 5)
     ]
     for answer in answers[1:]:

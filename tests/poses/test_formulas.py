@@ -96,7 +96,7 @@ def test_an_uncertain_bias_has_the_derivatives_of_the_gradient():
     for k, axis in enumerate(np.flatnonzero(sigma)):
         by_one = np.zeros(6)
         by_one[axis] = sigma[axis]
-        slope = dataclasses.replace(motion, bias=by_one).prior(poses)[2] - motion.prior(poses)[2]
+        slope = dataclasses.replace(motion, bias=by_one).prior(poses)[1] - motion.prior(poses)[1]
         assert_allclose(by[k], slope, atol=1e-9)
         spans2 = motion.spans**2 / motion.shares[:, axis]
         assert own[k] == pytest.approx(spans2.sum() * sigma[axis] ** 2 / [0.1**2, 0.02**2][axis // 3])
@@ -229,11 +229,9 @@ def test_motions_of_a_tracked_drive():
     rotation_vectors = np.stack([rotation_vector(step[:3, :3]) for step in between(poses[:-1], poses[1:])])
     drive = Drive([np.zeros((0, 3))] * 5, 0.5 * np.arange(5.0), None)
     (motion,) = drive.motions(poses, rotation_vectors, slice(0, 5))
-    rates = step_vectors(poses) / 0.5
-    middle, variance = drive.moves.conditional(rates[:, :3], np.full(4, 0.5))
-    off, expected = motion.errors(poses)[:, :3], 0.5 * (rates[:, :3] - middle)
-    assert_allclose(off / motion.shares[:, :3], expected / (0.25 * variance), atol=1e-12)
-    assert_allclose(off, expected / 2, atol=1e-12)
+    moves_m = step_vectors(poses)[:, :3]
+    assert_allclose(motion.errors(poses)[:, :3], np.diff(moves_m, axis=0, prepend=0), atol=1e-12)
+    assert_allclose(motion.shares[:, :3], np.array([[5.0**2], *[[2.0**2 * 0.5]] * 3]) * 0.5**2 * np.ones(3))
     assert np.isfinite(motion.shares).all()
     assert_allclose(motion.evidence().variances, [(0.5 * 5) ** 2, (0.5 * 0.3) ** 2])
     assert_allclose(motion.evidence().shares, 1)

@@ -293,8 +293,8 @@ def test_a_noisy_scan_has_an_unbiased_height(height_m):
     ]
     returns = SensorReturns.of(scans, 0.0, None)
     planes, _ = common_planes(returns, poses, 10, 0.4, None, ReturnsConfig(), 1)
-    weak = np.tile(np.eye(6), (10, 1, 1))
-    moved = planes.solve(weak, np.zeros((9, 6, 6)), np.zeros((10, 6)), 1e-6, 100, False, 1)[0][:, 2]
+    weak = np.tile(np.eye(6), (10, 1, 1, 1))
+    moved = planes.solve(weak, np.zeros((10, 6)), 1e-6, 100, False, 1)[0][:, 2]
     # 0.02 if returns were assigned to the cell of their position.
     assert abs(moved[::2].mean() - moved[1::2].mean()) < 0.01
 
@@ -307,7 +307,7 @@ def test_the_faces_of_a_wall_do_not_attract_each_other():
         face = rng.normal(0.2 + 0.03 * np.sign(x) - x, 0.01, 3000)
         scans.append(np.column_stack([face, rng.uniform(-2, 2, (3000, 2))]))
     planes, _ = common_planes(SensorReturns.of(scans, 0.0, None), poses, 10, 0.4, None, ReturnsConfig(), 1)
-    steps = np.tile(np.eye(6), (10, 1, 1)), np.zeros((9, 6, 6)), np.zeros((10, 6))
+    steps = np.tile(np.eye(6), (10, 1, 1, 1)), np.zeros((10, 6))
     moved = planes.solve(*steps, 1e-6, 100, False, 1)[0][:, 0]
     assert abs(moved[::2] - moved[1::2]).max() < 0.01
 

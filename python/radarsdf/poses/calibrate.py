@@ -190,7 +190,7 @@ def _step_rows(path: BodyPath, steps: Motion, times_s: Floats) -> tuple[Any, Flo
     poses = assembled(at.R, at.p)
     spread = np.sqrt(np.repeat(steps.variances, 3) * steps.shares)
     columns = path.columns(at, np.tile(np.eye(6, 12), (len(at.p), 1, 1)))
-    before, after = (_block_diagonal(jacobian / spread[:, :, None]) for jacobian in steps.jacobians(poses))
+    before, after = (_block_diagonal(jacobian / spread[:, :, None]) for jacobian in steps.jacobians(poses)[1])
     return before @ columns[:-6] + after @ columns[6:], steps.errors(poses) / spread
 
 

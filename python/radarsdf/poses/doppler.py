@@ -220,11 +220,10 @@ class DopplerMotion(Motion):
         between[:, :3, 3] = way(turns, begin, end, self.durations_s[:, None], levers)
         return replace(self, steps=between)
 
-    def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
-        both = super().jacobians(poses)
-        for jacobian in both:
-            jacobian[:, :3] -= self.velocities.of_steps[2] @ jacobian[:, 3:]
-        return both
+    def jacobians(self, poses: Floats) -> tuple[Ints, Floats]:
+        scans, jacobians = super().jacobians(poses)
+        jacobians[:, :, :3] -= self.velocities.of_steps[2] @ jacobians[:, :, 3:]
+        return scans, jacobians
 
 
 _ANY_MPS, _TURN_RAD_S = 100.0, 0.3  # prior deviations of a component of a velocity and of a turn rate

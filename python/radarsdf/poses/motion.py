@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.stats import qmc
 from typing_extensions import Self
 
-from radarsdf.arrays import Bools, Floats
+from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.poses.rigid import rotation, rotation_vector, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # weight of the initial motion prior, steps
@@ -19,6 +18,7 @@ _SPAN = 4.0  # width of a search, standard deviations
 _FEWEST, _MOST = 64, 8192  # limits of the number of poses of a search
 _AT_ONCE = 1e-3  # duration of a step between two radars that measure at the same time, median steps
 _LEAST_SPAN = 0.1  # minimum duration of a step, median steps: two scans at the same time may still differ
+_MOST_AT_ONCE = 8  # maximum number of such steps in succession: the band of the prior includes them
 LEAST_S = 1e-6  # of a step, against division by zero
 _YAW = 5  # component of a step
 _NO_LEVER = np.zeros((3, 3))
@@ -46,19 +46,14 @@ class MotionPrior:
         covariance = share**2 * rate.covariance + (1 - share**2) * np.diag(self.usual)
         return MotionRate(share * rate.mean, covariance)
 
-    def conditional(self, rates: Floats, durations_s: Floats) -> tuple[Floats, Floats]:
-        """Mean and variance (K, 3) of the rates (K, 3) of steps with durations (K,), each given its two neighbours."""
-        elapsed_s = (durations_s[1:] + durations_s[:-1])[:, None] / 2
-        share, variance = np.ones_like(rates[1:]), elapsed_s * self.change
-        if self.settles:
-            # By axis: a sensor that keeps turning in yaw may still pitch at random.
-            share = np.exp(-0.5 * elapsed_s * self.change / self.usual)
-            variance = (1 - share**2) * self.usual
-        before, after = np.zeros((2, 2, *rates.shape))  # information, and times rates
-        before[0, 0], before[:, 1:] = 1 / self.usual, [1 / variance, share * rates[:-1] / variance]
-        after[:, :-1] = share**2 / variance, share * rates[1:] / variance
-        information, total = before + after
-        return total / information, 1 / information
+    def transition(self, elapsed_s: Floats) -> tuple[Floats, Floats]:
+        """Share of a rate that remains after `elapsed_s` (K,), and the variance of what is added to it, (K, 3) each."""
+        elapsed_s = elapsed_s[:, None]
+        if not self.settles:
+            return np.ones((len(elapsed_s), 3)), elapsed_s * self.change
+        # By axis: a sensor that keeps turning in yaw may still pitch at random.
+        share = np.exp(-0.5 * elapsed_s * self.change / self.usual)
+        return share, (1 - share**2) * self.usual
 
     def learnt(
         self, rates: "Sequence[MotionRate | None]", durations_s: Floats, *, with_errors: bool = False
@@ -181,9 +176,6 @@ def step_variances(poses: Floats, diagonal: Floats, below: Floats) -> Floats:
 class Motion:
     """Motions between neighbouring scans measured by one source: given poses, Doppler, or a gyroscope."""
 
-    # Convergence threshold on increments, standard deviations. Planes change in each round: with 0.1, twice the time for the same errors.
-    settled: ClassVar[float] = 0.3
-
     steps: Floats  # (F - 1, 4, 4)
     shares: Floats  # (F - 1, 6) factors of the variances. Infinite for components that are not measured
     spans: Floats  # (F - 1,) duration of each step relative to the median, to which biases are proportional
@@ -213,27 +205,32 @@ class Motion:
         off_m = found[:, :3, 3] - self.steps[:, :3, 3]
         return np.concatenate([off_m, rotation_vector(turns)], 1)
 
-    def jacobians(self, poses: Floats) -> tuple[Floats, Floats]:
-        """Return Jacobians (F - 1, 6, 6) of :meth:`errors` by increments of the first and the second pose of a step."""
-        return _jacobians(poses)
+    def jacobians(self, poses: Floats) -> tuple[Ints, Floats]:
+        """Return the poses (K, F - 1) on which each residual depends, and its Jacobians (K, F - 1, 6, 6) by their increments."""
+        step = np.arange(len(self.spans))
+        return np.stack([step, step + 1]), np.stack(_jacobians(poses))
 
-    def prior(self, poses: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the normal equations of increments of `poses`: diagonal blocks (F, 6, 6), sub-diagonal ones, gradient (F, 6)."""
+    def prior(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Return the normal equations of increments of `poses`: band (F, W, 6, 6) as in CommonPlanes.solve, gradient (F, 6)."""
         information = 1 / (np.repeat(self.variances, 3) * self.shares)
-        first, second = self.jacobians(poses)
-        errors = (self.errors(poses) - self.bias * self.spans[:, None]) * information
-        diagonal, gradient = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
-        for rows, jacobian in ((slice(None, -1), first), (slice(1, None), second)):
-            diagonal[rows] += np.einsum("fki,fk,fkj->fij", jacobian, information, jacobian)
-            gradient[rows] += np.einsum("fki,fk->fi", jacobian, errors)
-        return diagonal, np.einsum("fki,fk,fkj->fij", second, information, first), gradient
+        scans, jacobians = self.jacobians(poses)
+        errors = self.errors(poses) - self.bias * self.spans[:, None]
+        last = (scans.max(axis=0) - scans.min(axis=0)).max()
+        band, gradient = np.zeros((len(poses), last + 1, 6, 6)), np.zeros((len(poses), 6))
+        for rows, jacobian in zip(scans, jacobians * information[:, :, None], strict=True):
+            np.add.at(gradient, rows, np.einsum("fki,fk->fi", jacobian, errors))
+            for columns, other in zip(scans, jacobians, strict=True):
+                lower = rows >= columns
+                blocks = np.einsum("fki,fkj->fij", jacobian[lower], other[lower])
+                np.add.at(band, (rows[lower], last - (rows - columns)[lower]), blocks)
+        return band, gradient
 
     def by_bias(self, poses: Floats) -> tuple[Floats, Floats]:
         """Return derivatives (K, F, 6) of the gradient by uncertain, normalised bias components, and their information (K,)."""
         rows = np.flatnonzero(self.bias_sigma)
         weights = self.spans[:, None] / (np.repeat(self.variances, 3) * self.shares) * self.bias_sigma
         found = np.zeros((len(rows), len(poses), 6))
-        for scans, jacobian in zip((slice(None, -1), slice(1, None)), self.jacobians(poses), strict=True):
+        for scans, jacobian in zip(*self.jacobians(poses), strict=True):
             found[:, scans] -= np.einsum("fki,fk->kfi", jacobian[:, rows], weights[:, rows])
         return found, (weights * self.spans[:, None] * self.bias_sigma).sum(axis=0)[rows]
 
@@ -262,50 +259,42 @@ class Motion:
 
 @dataclass(frozen=True)
 class SteadyMotion(Motion):
-    """Steps predicted by the motion priors, each from its two neighbours.
+    """Steps predicted by the motion priors, each from the one before it.
 
-    The posterior density is highest where all steps agree with these predictions. Tracked steps, taken as measurements, keep the
-    errors that they share with the returns: heights in a forest were wrong by 2 to 7 times as much.
+    Tracked steps, taken as measurements, keep the errors that they share with the returns: heights in a forest were wrong by 2 to 7
+    times as much.
     """
 
-    # Predictions follow the steps, so that a round comes only part of the way. Of three radars, errors are 1.5, 1.1 and 1.0 times those
-    # of convergence at 0.3, 0.2 and 0.1, after 5, 8 and 11 rounds; of one, 1.06 to 1.10 times those at 0.2 at 0.3.
-    settled = 0.2
-
-    priors: Priors
-    durations_s: Floats  # (F - 1,)
+    before: Ints  # (F - 1,) the step by which each is predicted
+    ratios: Floats  # (F - 1, 6) of its expectation to that step; 0: none
     usual: Floats  # (2,) variances of a step given the usual rates only, m² and rad²
-    vectors: Floats  # (F - 1, 6) steps of the previous update
-    updates: int = 0
 
     @classmethod
     def by(cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, known: Bools) -> Self:
         """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `known` by other sources."""
-        spans = spans_of(times_s)
-        duration_s = usual_duration_s(np.diff(times_s))
-        shares = np.tile(np.where(known, np.inf, 1.0), (len(spans), 1))
-        durations_s, vectors = np.maximum(np.diff(times_s), LEAST_S), step_vectors(poses)
-        motion = cls(steps(poses), shares, spans, priors, durations_s, duration_s**2 * usual, vectors)
-        return motion.updated(poses)
+        durations_s, usual_s = np.maximum(np.diff(times_s), LEAST_S), usual_duration_s(np.diff(times_s))
+        # Radars that measure almost at once show no rate: as rates of 0, such steps bent both ends of a drive by 5 degrees.
+        step = np.arange(len(durations_s))
+        timed = np.where(durations_s >= _LEAST_SPAN * usual_s, step, -1)
+        before = np.append(-1, np.maximum.accumulate(timed)[:-1])
+        before = np.where((before >= 0) & (step - before <= _MOST_AT_ONCE), before, step)
+        both = [prior.transition((durations_s + durations_s[before]) / 2) for prior in priors]
+        kept, added = (np.concatenate(parts, axis=1) for parts in zip(*both, strict=True))
+        follows, all_usual = (before < step)[:, None], np.concatenate([prior.usual for prior in priors])
+        ratios = np.where(follows, kept * (durations_s / durations_s[before])[:, None], 0.0)
+        variances = np.where(follows, added, all_usual) * durations_s[:, None] ** 2
+        shares = np.where(known, np.inf, np.maximum(variances, np.repeat(_LEAST, 3)))
+        return cls(steps(poses), shares, spans_of(times_s), before, ratios, usual_s**2 * usual).updated(poses)
 
     def updated(self, poses: Floats, *_: Floats) -> Self:
-        """Predict each step of `poses` from its neighbours."""
-        durations_s = self.durations_s[:, None]
-        # Radars that measure almost at once show no rate: as rates of 0, such steps bent both ends of a drive by 5 degrees.
-        timed = self.durations_s >= _LEAST_SPAN * usual_duration_s(self.durations_s)
-        # Steps that change together do so slowly: the last change is extrapolated (Nesterov 1983), which halves the number of rounds.
-        vectors, own_s = step_vectors(poses), self.durations_s[timed]
-        ahead = vectors + self.updates / (self.updates + 3) * (vectors - self.vectors)
-        rates = np.split(ahead[timed] / own_s[:, None], 2, axis=1)
-        both = [p.conditional(r, own_s) for p, r in zip(self.priors, rates, strict=True)]
-        measured = np.maximum(np.cumsum(timed) - 1, 0)  # row of `rates` for each step
-        # Damped by half at twice the information: the same gradient, but steps that move together do not overshoot.
-        moves, turns = (0.5 * durations_s * (r + m)[measured] for r, (m, _) in zip(rates, both, strict=True))
-        variances = np.concatenate([v for _, v in both], axis=1)[measured] * 0.5 * durations_s**2
-        variances = np.maximum(variances, np.repeat(_LEAST, 3))
-        shares = np.where(np.isinf(self.shares), np.inf, variances)
-        predicted = transform(turns, moves)
-        return replace(self, steps=predicted, shares=shares, vectors=vectors, updates=self.updates + 1)
+        """Predict each step of `poses` from the one before it."""
+        moves, turns = np.split(self.ratios * step_vectors(poses)[self.before], 2, axis=1)
+        return replace(self, steps=transform(turns, moves))
+
+    def jacobians(self, poses: Floats) -> tuple[Ints, Floats]:
+        scans, own = super().jacobians(poses)
+        predicted = -self.ratios[:, :, None] * own[:, self.before]
+        return np.concatenate([scans, scans[:, self.before]]), np.concatenate([own, predicted])
 
     def evidence(self) -> Motion:
         """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""

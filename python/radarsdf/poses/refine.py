@@ -34,6 +34,8 @@ _MOST_ROUNDS = 12  # maximum number of rounds with the cells of a map's surfels
 # Coarse planes are kept if fine ones double the standard deviation of a component of the steps, of few returns. By less, they do not
 # lose: surfaces are less flat in coarse cells, which no variance includes.
 _COARSER = np.log(4)
+# Convergence threshold on increments, standard deviations. Planes change in each round: with 0.1, twice the time for the same errors.
+_SETTLED = 0.3
 _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
 # Information of a weak prior on each pose, 1/m² and 1/rad²: unobserved components are not changed.
 WEAK = 1e-4
@@ -77,7 +79,6 @@ class JointEstimator:
         doubled = (_FIRST_WINDOW << k for k in itertools.count())
         short = itertools.takewhile(lambda window: far and window < count, doubled)
         of_all = *_OF_ALL, *[1] * _MOST_ROUNDS
-        settled = min(motion.settled for motion in motions)
         plan = [*itertools.product(short, _OF_WINDOWS), *itertools.product([count], of_all)]
         bar = tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress))
         for rounds, (window, planned) in enumerate(bar, 1):
@@ -95,20 +96,20 @@ class JointEstimator:
             before, poses = poses, moved(poses, steps)
             poses = aligned(poses, given) if anchor is None else poses
             motions = [motion.updated(poses, before, inverse, inverse_below) for motion in motions]
-            if window == count and cells == finest and decrement < settled**2 * steps.size:
+            if window == count and cells == finest and decrement < _SETTLED**2 * steps.size:
                 break
         assert noise is not None
         evidence = [motion.evidence() for motion in motions]
-        diagonal, below, gradient = _prior(evidence, poses, anchor)
+        prior, gradient = _prior(evidence, poses, anchor)
         if anchor is None:
-            diagonal[count // 2] += _FIXED * np.eye(6)
-        covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
+            prior[count // 2, -1] += _FIXED * np.eye(6)
+        covariance = planes.solve(prior, gradient, _TOLERANCE, 0, True, num_threads)[1]
         own = planes.equations[1].reshape(count, 6)
 
         def solve(gradient: Floats) -> Floats:
             """Solve for increments (F, 6) with this gradient (F, 6) alone."""
             others = gradient - own
-            return planes.solve(diagonal, below, others, _TOLERANCE, _MOST_ITERATIONS, False, num_threads)[0]
+            return planes.solve(prior, others, _TOLERANCE, _MOST_ITERATIONS, False, num_threads)[0]
 
         covariance = covariance + _by_biases(evidence, poses, solve)
         return PosesEstimate(poses, covariance, motions, noise, rounds)
@@ -147,14 +148,19 @@ def _held_out(returns: SensorReturns, seed: int) -> tuple[SensorReturns, SensorR
     return returns.select(held), returns.select(~held)
 
 
-def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> tuple[Floats, Floats, Floats]:
+def _prior(motions: Sequence[Motion], poses: Floats, anchor: Anchor | None) -> tuple[Floats, Floats]:
     """Sum the normal equations of motions, see :meth:`Motion.prior`, and anchor."""
-    parts = [motion.prior(poses) for motion in motions]
-    diagonal, below, gradient = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
+    bands, gradients = zip(*(motion.prior(poses) for motion in motions), strict=True)
+    gradient, width = np.sum(gradients, axis=0), max(band.shape[1] for band in bands)
+    total = np.sum(
+        [np.pad(band, [(0, 0), (width - band.shape[1], 0), (0, 0), (0, 0)]) for band in bands], axis=0
+    )
     if anchor is not None:
         of_poses, of_gradient = anchor(poses)
-        diagonal, gradient = diagonal + of_poses, gradient + of_gradient
-    return diagonal + WEAK * np.eye(6), below, gradient
+        total[:, -1] += of_poses
+        gradient += of_gradient
+    total[:, -1] += WEAK * np.eye(6)
+    return total, gradient
 
 
 def _by_biases(motions: Sequence[Motion], poses: Floats, solve: Callable[[Floats], Floats]) -> Floats:
