@@ -132,8 +132,7 @@ void bind_losses(py::module_& m) {
       "samples, that of the intensities. `parts` are consecutive samples for one thread: numbers of samples, and of "
       "samples with intensity labels. Gradients are summed in the order of the parts, independent of the number of "
       "threads. `dropout` has up to two pairs, for the encodings of cells and positions: seed of `random_bytes` "
-      "(samples "
-      "seen, columns), and the bound below which a byte keeps its element.");
+      "(samples seen, columns), and the bound below which a byte keeps its element.");
   cls.def(
       "finish",
       [](LossArrays& self, HeldThreadPool& pool) {

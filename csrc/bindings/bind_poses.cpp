@@ -96,8 +96,7 @@ void bind_poses(py::module_& m) {
            "Points (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, "
            "ascending; `planes` (N,) int32, -1 for none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` "
            "(P, 3) float64. `extent_m` of a plane; `noise` (F, 3) float64: variances along the beam, m^2, in azimuth "
-           "and "
-           "elevation, rad^2.")
+           "and elevation, rad^2.")
       .def_property_readonly("scale", &CommonPlanes::scale,
                              "Median squared normalised residual, relative to that of Gaussian noise; at least 1.")
       .def_property_readonly(

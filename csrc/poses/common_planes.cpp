@@ -11,10 +11,7 @@
 namespace radarsdf {
 namespace {
 
-constexpr double kMedianOfSquare = 0.4549;  // of a standard normal variate
-constexpr double kSigmas2 = 4;              // squared scale of the Geman-McClure weight: 1/4 at two standard deviations
-constexpr double kLeastM2 = 1e-10;          // lower bound of variances, which are divisors
-constexpr int kPlane = 3;                   // unknowns of a plane
+constexpr int kPlane = 3;  // unknowns of a plane
 constexpr int kCoupling = kPlane * kPose;
 
 // Completes the unit vector n to an orthonormal basis.
@@ -111,8 +108,8 @@ struct CommonPlanes::Input {
     found.along[0] = 1;
     found.along[1] = dot(off, e1) / planes.extent_m;
     found.along[2] = dot(off, e2) / planes.extent_m;
-    found.variance = variance_along(n, vec3(returns.directions, i), returns.ranges_m[i], vec3(returns.up_of_scan, scan),
-                                    variances_of(returns.noise_of_scan + 3 * scan));
+    const Beam beam(returns.ranges_m[i] * vec3(returns.directions, i), vec3(returns.up_of_scan, scan));
+    found.variance = beam.variance_along(n, variances_of(returns.noise_of_scan + 3 * scan));
     store(n, found.jacobian);
     store(cross(arm, n), found.jacobian + 3);
     return found;
@@ -177,9 +174,7 @@ void CommonPlanes::find_scale(const Input& input, int num_threads) {
     const Input::Residual found = input.residual(input.rows[k]);
     ratios[k] = found.value * found.value / std::max(found.variance, kLeastM2);
   });
-  const auto middle = ratios.begin() + static_cast<std::ptrdiff_t>(ratios.size() / 2);
-  std::nth_element(ratios.begin(), middle, ratios.end());
-  scale_ = std::max(1.0, *middle / kMedianOfSquare);
+  scale_ = scale_of(ratios);
 }
 
 void CommonPlanes::eliminate_planes(Input& input, int num_threads) {
@@ -202,8 +197,8 @@ void CommonPlanes::eliminate_plane(Input& input, std::int64_t plane) {
     if (input.returns.scans[i] != scan_of_cluster_[cluster]) ++cluster;
     const Input::Residual found = input.residual(i);
     const double variance = scale_ * std::max(found.variance, kLeastM2);
-    const double robust = 1 / (1 + found.value * found.value / (kSigmas2 * variance));
-    const auto w = static_cast<float>(robust * robust / variance);
+    const double share = robust_share(found.value, variance);
+    const auto w = static_cast<float>(share * share / variance);
     input.weights[i] = w;
     sums[cluster - base].add(found.along, w, found.value);
     double* c = &coupling_[kCoupling * cluster];

@@ -47,8 +47,8 @@ class LocalPlanes {
   static constexpr int kMoments = 10;  // 1, x, y, z, xx, xy, xz, yy, yz, zz, in quanta from the corner of the cell
   using Moments = std::array<std::int64_t, kMoments>;
   struct Plane {
-    Vec3 centre, axes[3];  // the normal first
-    double variances[3], count;
+    Vec3 centre, axes[3];  // the normal, and in the plane, each as long as the standard deviation of its slope
+    double variance;       // at the centre, m^2
   };
   struct Residual {
     double value, variance;
@@ -57,11 +57,9 @@ class LocalPlanes {
 
   std::optional<std::uint64_t> key(const Vec3& point) const;
   std::optional<Plane> plane_of(std::uint64_t key) const;  // if it is flat
-  // direction: an array, as gcc 12 -O3 leaves out the rounding of a Vec3 to float and back.
-  std::optional<Residual> residual(const Vec3& point, const float* direction, double range_m, const Vec3& up,
-                                   const ReturnVariances& noise) const;
+  std::optional<Residual> residual(const Beam& beam, const double* pose, const ReturnVariances& noise) const;
 
-  double cell_size_m_;
+  double cell_size_m_, cells_per_m_;
   FlatMap cells_;  // rows of sums_
   std::vector<Moments> sums_;
   std::vector<std::int32_t> free_;  // rows of sums_ without a cell

@@ -30,9 +30,8 @@ void move_onto_planes(const NoisyRays& rays, const Planes& planes, const MovedRa
   }
   // Variance of a return's position along the plane's normal.
   const auto variance_m2 = [&](std::int64_t i, const Plane& plane) {
-    return variance_along(plane.normal, vec3(rays.directions, i), rays.ranges_m[i],
-                          vec3(rays.up_of_scan, rays.scans[i]),
-                          variances_of(rays.noise_of_scan + 3 * std::int64_t{rays.scans[i]}));
+    const Beam beam(rays.ranges_m[i] * vec3(rays.directions, i), vec3(rays.up_of_scan, rays.scans[i]));
+    return beam.variance_along(plane.normal, variances_of(rays.noise_of_scan + 3 * std::int64_t{rays.scans[i]}));
   };
   const auto plane_of = [&](std::int64_t i) {
     prefetch(own.data() + std::max(rays.planes[std::min(i + kAhead, rays.count - 1)], 0));
