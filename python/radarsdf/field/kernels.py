@@ -108,9 +108,15 @@ class _Interpolate(torch.autograd.Function):
 class _InterpolateBackward(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, out_grad: Tensor, features: Tensor, points: Tensor, located: Tensor, *others: Any
+        ctx: Any,
+        out_grad: Tensor,
+        features: Tensor,
+        points: Tensor,
+        located: Tensor,
+        table: VertexTable,
+        needs_features: bool,
+        needs_points: bool,
     ) -> tuple[Tensor | None, Tensor | None]:
-        table, needs_features, needs_points = others
         ctx.save_for_backward(out_grad, features, points, located)
         ctx.table = table
         ctx.set_materialize_grads(False)  # unused gradients are None, not zeros to interpolate
@@ -236,6 +242,7 @@ class _MLP(torch.autograd.Function):
         views: list[Any] = [None if g is None else g.numpy() for g in grads]
         by_weights, by_biases = (views[:split:2], views[1:split:2]) if by_layers else (None, None)
         given: tuple[_Views, _Views, _Views] = ctx.views
-        into = by_weights, by_biases, views[split:]
-        _core.mlp_backward(*given, ctx.hidden, rows_view(out_grad), *into, threads())
+        _core.mlp_backward(
+            *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
+        )
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
