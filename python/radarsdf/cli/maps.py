@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import radarsdf
-from radarsdf import evaluation
 from radarsdf.arrays import Floats
 from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
@@ -18,7 +17,7 @@ from radarsdf.cli import Results
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.scans import add_scans, located, unposed_scans
-from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
+from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics, surface_metrics
 from radarsdf.extras import require
 from radarsdf.grids.grid import DISTANCE_SUFFIXES, save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
@@ -77,8 +76,8 @@ def evaluate(given: Namespace, results: Results) -> None:
             found = read_mesh(mesh_file)
         else:
             found = radar_map.mesh(given.voxel, **mesh_limits(given), progress=results.progress)
-        metrics = evaluation.surface_metrics(found, ground_truth, box=given.box, samples=given.samples)
-        results.add(evaluation.format_metrics(metrics), surface=metrics)
+        metrics = surface_metrics(found, ground_truth, box=given.box, samples=given.samples)
+        results.add(format_metrics(metrics), surface=metrics)
     if radar_map is not None and scans is not None:
         known, held_out = split(scans, holdout)
         if held_out is not None:

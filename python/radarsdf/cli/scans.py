@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import radarsdf
-from radarsdf import FitConfig
 from radarsdf.arrays import Floats
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
@@ -88,7 +87,7 @@ def write_posed(out: Path, scans: Scans, results: Results, incomplete: str) -> N
 
 
 def posed_scans(
-    scans: Scans, unposed: bool, config: FitConfig, results: Results, *, refine: bool
+    scans: Scans, unposed: bool, config: radarsdf.FitConfig, results: Results, *, refine: bool
 ) -> tuple[Scans, PosedScans]:
     """Estimate the poses of `unposed` scans, or `refine` those of others. Of several segments, return the scans of the longest one."""
     if unposed:

@@ -3,7 +3,6 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -134,7 +133,7 @@ _Stop = KeyboardInterrupt | Diverged | None
 _ENOUGH_RETURNS, _ENOUGH_PER_PLANE = 200_000, 16
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class FitInput:
     """Input of a fit. Fields that are None are computed from the rays."""
 
@@ -176,7 +175,7 @@ def fit_rays(
     return radar_map
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class _Fit:
     config: FitConfig
     progress: bool | None

@@ -17,7 +17,6 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, confidence, free_space_odds, uncertainty
-from radarsdf.map.queries import MapContents
 from radarsdf.map.threshold import VOXEL_M
 from radarsdf.map.view import DepthImage, View, ViewedMap, view_from
 from radarsdf.memory import check_views
@@ -423,7 +422,7 @@ class Map(ABC):
 
     @property
     @abstractmethod
-    def contents_of_any(self) -> MapContents:
+    def contents_of_any(self) -> queries.MapContents:
         """The contents of the map, or of any of its tiles, for properties that all share."""
 
     @cached_property

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
@@ -40,7 +39,7 @@ class Deferred(Generic[_Part]):
         return self._part
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class WholeMap:
     """Properties of the whole map on which evidence at a place depends, besides the returns there."""
 
@@ -50,7 +49,7 @@ class WholeMap:
     returns_per_cell: float  # mean number of returns in the cells of surfels with returns
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class MapContents(WholeMap):
     field: Field  # signed distance and intensity, in the local frame
     intensity_scale: IntensityScale | None  # range of the training intensities. None without intensities

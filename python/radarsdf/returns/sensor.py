@@ -1,10 +1,9 @@
 """Sensor model: field of view, resolution, detection threshold and noise, estimated from scans; and the radars of a rig."""
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -74,7 +73,7 @@ class Sensor:
             object.__setattr__(self, name, found)
         fits = 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7
         check(fits, f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}")
-        for value in dataclasses.astuple(self.noise):
+        for value in astuple(self.noise):
             not_negative(value, "noise")
         steps = tuple(_pair(step, "thresholds") for step in self.thresholds)
         fits = not any(a >= b for (a, _), (b, _) in itertools.pairwise(steps))
@@ -112,7 +111,7 @@ class Sensor:
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict that JSON can store. :meth:`from_dict` is the inverse."""
-        described = dataclasses.asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
+        described = asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
         unit = described.pop("unit")
         return described if unit == SAME_UNIT else described | {"unit": list(unit)}
 
@@ -223,7 +222,7 @@ class Radars:
             values = rays.intensities.copy()
             for unit, rows in zip(units, rays.rows_of_sensors(), strict=True):
                 values[rows] = in_map_unit(values[rows], unit or SAME_UNIT)  # without a unit they stay
-            rays = dataclasses.replace(rays, intensities=values)
+            rays = replace(rays, intensities=values)
         return rays, cls(rig.labels, noise, units)
 
     def sensors(self, rays: Rays, poses: ArrayLike) -> dict[Label, Sensor]:
@@ -234,7 +233,7 @@ class Radars:
             if len(own := rays.select(rows)):
                 sensor, (gain, offset) = Sensor.of_rays(own, poses, noise), unit or SAME_UNIT
                 thresholds = tuple((range_m, gain * low + offset) for range_m, low in sensor.thresholds)
-                found[label] = dataclasses.replace(sensor, thresholds=thresholds, unit=(gain, offset))
+                found[label] = replace(sensor, thresholds=thresholds, unit=(gain, offset))
         return found
 
     def report(self, rays: Rays) -> dict[str, Any]:
@@ -243,7 +242,7 @@ class Radars:
         each = zip(self.labels, self.noise.of_sensors, self.units, rays.rows_of_sensors(), strict=True)
         for label, noise, unit, rows in each:
             gain, offset = unit or (None, None)
-            own = {"returns": len(rays.points[rows]), "noise": dataclasses.asdict(noise)}
+            own = {"returns": len(rays.points[rows]), "noise": asdict(noise)}
             found[str(label)] = own | {"intensity_gain": gain, "intensity_offset": offset}
         return found
 

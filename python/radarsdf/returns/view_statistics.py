@@ -1,8 +1,7 @@
 """What grids and comparisons need of a map: free-space crossings of leaf cells, and mean intensities by place and view."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -135,7 +134,7 @@ class ViewStatisticsAt:
     sigma: float  # standard deviation of single returns from the mean of their group
 
     def select(self, chosen: Bools) -> "ViewStatisticsAt":
-        return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @classmethod
     def together(cls, parts: "Sequence[ViewStatisticsAt]") -> "ViewStatisticsAt":

@@ -5,10 +5,9 @@ between two meshes. So a step recolours a cloud of some vertices in place. After
 scene stays until the page has drawn it.
 """
 
-import dataclasses
 import threading
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,7 +56,7 @@ class Painter:
     def change(self, **fields: Any) -> None:
         """Change fields of the state, from any thread, without waiting."""
         with self._changed:
-            self.newest = dataclasses.replace(self.newest, **fields)
+            self.newest = replace(self.newest, **fields)
             self._pending = True
             self._changed.notify_all()
 
