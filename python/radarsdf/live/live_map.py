@@ -511,7 +511,13 @@ class LiveMap:
             **known,
         )
 
-    def _check(self, points: Any, intensities: Any, doppler_mps: Any, time_s: Any) -> tuple[LoggedScan, int]:
+    def _check(
+        self,
+        points: ArrayLike,
+        intensities: ArrayLike | None,
+        doppler_mps: ArrayLike | None,
+        time_s: float | None,
+    ) -> tuple[LoggedScan, int]:
         """Check a scan, without a pose yet, and count returns too far away. Raise a ValueError if it is invalid."""
         scans, values, left_out = check_scans([points], None if intensities is None else [intensities])
         scan = scans[0].copy()

@@ -155,14 +155,8 @@ class Sensor:
         R = T_world_sensor[:, :3, :3]
         x, y, z = (sum(R[:, j, i][scans] * from_sensor[j] for j in range(3)) for i in range(3))
         range_m = np.sqrt(x * x + y * y + z * z)
-        thresholds: tuple[tuple[float, float], ...] = ()
-        if rays.intensities is not None:
-            values = rays.intensities[rows].astype(np.float64)
-            known = np.isfinite(values)
-            order = np.lexsort((values[known], range_m[known]))  # equal ranges in an order of their own
-            bins = [rows for rows in np.array_split(np.flatnonzero(known)[order], _RANGE_BINS) if len(rows)]
-            of_bins = ((np.median(range_m[rows]), np.quantile(values[rows], _WEAKEST)) for rows in bins)
-            thresholds = tuple(sorted({float(at_m): float(weakest) for at_m, weakest in of_bins}.items()))
+        values = rays.intensities
+        thresholds = () if values is None else _thresholds(range_m, values[rows].astype(np.float64))
         per_scan = np.bincount(rays.scans)
         return cls(
             azimuth_rad=_limits(np.arctan2(y, x)),
@@ -185,6 +179,15 @@ def _limits(values: Floats) -> tuple[float, float]:
     if low == high:  # very few returns
         low -= 1e-3 * max(abs(low), 1e-3)
     return float(low), float(high)
+
+
+def _thresholds(range_m: Floats, values: Floats) -> tuple[tuple[float, float], ...]:
+    """Return :attr:`Sensor.thresholds` of returns at ranges (N,), m, with intensities (N,), NaN where missing."""
+    known = np.isfinite(values)
+    order = np.lexsort((values[known], range_m[known]))  # equal ranges in an order of their own
+    bins = [rows for rows in np.array_split(np.flatnonzero(known)[order], _RANGE_BINS) if len(rows)]
+    of_bins = ((np.median(range_m[rows]), np.quantile(values[rows], _WEAKEST)) for rows in bins)
+    return tuple(sorted({float(at_m): float(weakest) for at_m, weakest in of_bins}.items()))
 
 
 _MOST_RETURNS = 60_000  # sample size
