@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats
 
 # Largest coordinate: squares of it, and products of three, are far from overflow in float64.
 MAX_POSITION_M = 1e12

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import mesh_components
-from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
+from radarsdf.arrays import ArrayLike, Bytes, Floats, Floats32, Ints32, NDArray
 from radarsdf.changes.alignment import Alignment, align
 from radarsdf.changes.probability import Differences, Errors, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.checks import AnyPath, check, check_box, instance, path_of

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import radarsdf
-from radarsdf.arrays import Floats
+from radarsdf.arrays import Floats, NDArray
 from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
 from radarsdf.cli import Results

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from radarsdf._core import FEATURE_DIM, CellSet
-from radarsdf.arrays import Bools
+from radarsdf.arrays import ArrayLike, Bools
 from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import intensity_widths, sdf_widths, weights_of

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 
 from radarsdf._core import cell_keys, stable_order
-from radarsdf.arrays import Bools, Floats32, Ints
+from radarsdf.arrays import ArrayLike, Bools, Floats32, Ints
 from radarsdf.checks import AnyPath, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field, NeuralField

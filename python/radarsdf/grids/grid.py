@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.ndimage import distance_transform_edt
 
-from radarsdf.arrays import Bools, Floats, Floats32, Ints
+from radarsdf.arrays import ArrayLike, Bools, Floats, Floats32, Ints, NDArray
 from radarsdf.checks import AnyPath, check, number, path_of, real_array
 from radarsdf.grids.files import write_map_server, write_octomap, write_vdb
 from radarsdf.io.files import checked_suffix

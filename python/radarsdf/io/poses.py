@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from radarsdf import checks
-from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats
 from radarsdf.checks import AnyPath, check, check_pose, check_poses, path_of, real_array
 from radarsdf.io.columns import in_seconds, read_numbers, read_table, read_text, scaled, without_unit
 from radarsdf.io.files import check_regular_file, checked_suffix, reading, write_whole

@@ -6,13 +6,12 @@ import weakref
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from radarsdf import checks
-from radarsdf.arrays import Floats, Keys
+from radarsdf.arrays import ArrayLike, Floats, Keys, Mesh
 from radarsdf.checks import AnyPath, check, check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit, fit_rays
@@ -31,9 +30,6 @@ from radarsdf.returns.moving import moving_returns
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Label, Mounted, checked_mountings
 from radarsdf.scans import Scans
-
-if TYPE_CHECKING:
-    import trimesh
 
 _MOST_UNPLACED = 10 * SUBMAP_SCANS  # lost scans to search the map for
 _RANGED = 100  # scans from which the median range is known
@@ -453,7 +449,7 @@ class LiveMap:
             live._state.track = live._state.track.placed(scan_id, scan)
         return live
 
-    def mesh(self, **limits: Any) -> "trimesh.Trimesh":
+    def mesh(self, **limits: Any) -> Mesh:
         """Extract the surface as triangles, world frame, m, in voxels of the size of leaf cells; none if there is no surface.
 
         Only changed distances are recomputed. `limits` are `min_confidence`, `max_uncertainty` and `min_component_triangles` of

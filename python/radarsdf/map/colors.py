@@ -1,9 +1,8 @@
 """Colour map of intensities."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Bytes
+from radarsdf.arrays import ArrayLike, Bytes
 from radarsdf.checks import check, real_array
 
 # From indigo through magenta and orange to yellow. Lightness increases from 0.32 to 0.93 in OKLab, in equal steps.

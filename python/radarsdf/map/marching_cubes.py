@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from radarsdf import _core
-from radarsdf.arrays import Array, Bools, Ints32
+from radarsdf.arrays import Array, ArrayLike, Bools, Ints32
 from radarsdf.checks import check, real_array, refuse_masked
 
 

@@ -4,14 +4,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from radarsdf._core import marching_cubes_sparse, mesh_components, vertex_areas
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Mesh, NDArray
 from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
@@ -19,9 +18,6 @@ from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.queries import MapContents, WholeMap, evaluate, signed_distance, to_local
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_memory
-
-if TYPE_CHECKING:
-    import trimesh
 
 _MAX_VOXELS = 2**30  # duplicates included. Lattice coordinates and rows of corners are int32
 _MEMORY_PER_VOXEL = 220.0  # bytes, measured
@@ -77,13 +73,13 @@ class Surface:
             kept[rows] = large.take(labels)
         return kept
 
-    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> "trimesh.Trimesh":
+    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> Mesh:
         """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         threshold = self.tally.threshold(limits.min_confidence)
         return self.part(origin, self.kept(limits), **counts, **vars(threshold))
 
-    def part(self, origin: Floats, kept: Bools, **metadata: float) -> "trimesh.Trimesh":
+    def part(self, origin: Floats, kept: Bools, **metadata: float) -> Mesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
         import trimesh  # noqa: PLC0415 - slow
 

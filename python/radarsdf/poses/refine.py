@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Bools, Floats
+from radarsdf.arrays import ArrayLike, Bools, Floats
 from radarsdf.checks import check, hides_bar, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Verdict

@@ -11,10 +11,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from radarsdf.arrays import Array, Bytes, Floats
+from radarsdf.arrays import Array, ArrayLike, Bytes, Floats
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
 from radarsdf.checking.recording import Finding
 from radarsdf.checks import AnyPath

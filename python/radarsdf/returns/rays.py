@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import checks
 from radarsdf._core import hash_rays, scan_rays
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Floats32, Ints, Ints32, Keys, NDArray
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
 from radarsdf.rig import Rig

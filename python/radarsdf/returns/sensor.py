@@ -7,9 +7,8 @@ from dataclasses import asdict, astuple, dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Floats32, Ints
 from radarsdf.checks import check, not_negative, number, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.products import product

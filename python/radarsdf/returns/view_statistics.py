@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import cell_rows, find_free_space
-from radarsdf.arrays import AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.arrays import AnyFloats, ArrayLike, Bools, Bytes, Floats, Floats32, Ints, Ints32, Keys, NDArray
 from radarsdf.checks import check
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.rays import Rays

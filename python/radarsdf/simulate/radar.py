@@ -6,11 +6,10 @@ from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import gammaincinv
 
-from radarsdf.arrays import Bools, Floats, Floats32, Ints
+from radarsdf.arrays import Bools, Floats, Floats32, Ints, NDArray
 from radarsdf.checks import check, check_poses, instance, whole_number
 from radarsdf.returns.sensor import Sensor
 from radarsdf.settings import settings

@@ -8,10 +8,9 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from numpy.typing import ArrayLike
 
 from radarsdf._core import SurfaceTracer
-from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Array, ArrayLike, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check
 from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
 from radarsdf.map.map import Map
