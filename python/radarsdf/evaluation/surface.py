@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from radarsdf._core import cell_keys
 from radarsdf.arrays import ArrayLike, Bools, Floats, Ints, Mesh
 from radarsdf.checks import check, check_box, positions, whole_number
+from radarsdf.core import cell_keys
 from radarsdf.threads import resolve_num_threads
 
 PROTOCOL = "radarsdf-surface-1"  # changes with the meaning of a number

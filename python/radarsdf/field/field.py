@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
 from radarsdf.arrays import Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
 from radarsdf.field import kernels
 from radarsdf.returns.reflectance import Reflectance
 

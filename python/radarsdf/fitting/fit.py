@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from radarsdf._core import cell_keys, stable_order
 from radarsdf.arrays import ArrayLike, Bools, Floats32, Ints
 from radarsdf.checks import AnyPath, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import cell_keys, stable_order
 from radarsdf.field.field import Field, NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule, check_extent, check_fit, skipped_parts

@@ -7,9 +7,9 @@ from uuid import UUID
 
 import numpy as np
 
-from radarsdf._core import cell_keys
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, NDArray
 from radarsdf.checks import check
+from radarsdf.core import cell_keys
 from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 
 _PIXELS = np.array([254, 0, 205], np.uint8)  # grey values of map_saver for free, occupied and unknown

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, Encoding, VertexTable, cell_keys, marching_cubes_sparse
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import CellBlocks, Encoding, VertexTable, cell_keys, marching_cubes_sparse
 from radarsdf.fitting.surface_returns import (
     BAND_CELLS,
     CELLS_SMOOTHED,

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from radarsdf._core import CellBlocks
 from radarsdf.arrays import Bools, Bytes, Floats, Floats32, Ints
+from radarsdf.core import CellBlocks
 from radarsdf.map.queries import MapContents, WholeMap, plane, signed_distance
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of

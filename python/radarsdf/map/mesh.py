@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from radarsdf._core import marching_cubes_sparse, mesh_components, vertex_areas
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Mesh, NDArray
 from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import marching_cubes_sparse, mesh_components, vertex_areas
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
 from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.queries import MapContents, WholeMap, evaluate, signed_distance, to_local

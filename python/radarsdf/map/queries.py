@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from radarsdf._core import CellBlocks
 from radarsdf.arrays import Array, Bools, Floats, Floats32
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import CellBlocks
 from radarsdf.field.field import Field
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.intensities import IntensityScale

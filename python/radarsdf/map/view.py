@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from radarsdf._core import SurfaceTracer, cell_keys
 from radarsdf.arrays import Floats, Floats32, Ints
 from radarsdf.checks import check, flag, number, whole_number
+from radarsdf.core import SurfaceTracer, cell_keys
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, roughness
 from radarsdf.map.mesh import Surface

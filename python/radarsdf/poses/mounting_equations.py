@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from radarsdf._core import CommonPlanes
 from radarsdf.arrays import Floats, Ints32
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import CommonPlanes
 from radarsdf.poses.body_path import OF_RADAR, BodyPath
 from radarsdf.poses.motion import Motion
 from radarsdf.poses.planes import SensorReturns, planes_of, unbiased_normals

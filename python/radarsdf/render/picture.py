@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import ArrayLike, Bytes, Floats, Floats32, Ints32, Mesh
 from radarsdf.checks import AnyPath, check, real_array
+from radarsdf.core import SurfaceTracer
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.figures import Scale, new_figure, png_of

@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_scans, count_visibility
 from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.core import CellBlocks, block_medians, bridge_cells, count_scans, count_visibility
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import WEIGHT_UNIT, MeanRays, ReturnCells, merged_keys

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from radarsdf import checks
-from radarsdf._core import hash_rays, scan_rays
 from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Floats32, Ints, Ints32, Keys, NDArray
+from radarsdf.core import hash_rays, scan_rays
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
 from radarsdf.rig import Rig

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
 from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints, Ints32, Keys, NDArray
 from radarsdf.checks import check
+from radarsdf.core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
 from radarsdf.products import normal_matrix, product
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays

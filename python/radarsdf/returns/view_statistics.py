@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from radarsdf._core import cell_rows, find_free_space
 from radarsdf.arrays import AnyFloats, ArrayLike, Bools, Bytes, Floats, Floats32, Ints, Ints32, Keys, NDArray
 from radarsdf.checks import check
+from radarsdf.core import cell_rows, find_free_space
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from radarsdf._core import marching_cubes_sparse
 from radarsdf.arrays import Array, ArrayLike, Floats, Floats32, Ints, Ints32, Mesh
 from radarsdf.checks import check, check_box, hides_bar, positive
+from radarsdf.core import marching_cubes_sparse
 from radarsdf.io.files import check_outputs, reading, write_whole
 from radarsdf.io.meshes import MATT, T_GLTF_WORLD, encode_glb
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays

@@ -9,9 +9,9 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from radarsdf._core import SurfaceTracer
 from radarsdf.arrays import Array, ArrayLike, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check
+from radarsdf.core import SurfaceTracer
 from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
 from radarsdf.map.map import Map
 from radarsdf.map.mesh import renumbered, with_all
