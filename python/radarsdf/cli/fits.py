@@ -90,7 +90,7 @@ def demo(given: Namespace, results: Results) -> None:
         in_terminal = sys.stdout is not None and sys.stdout.isatty() and not results.json
         view = in_terminal and serving.has_display() and find_spec("viser") is not None
     elif view:
-        serving.require_viser()
+        serving.page_port(serving.LOCALHOST, None)
     drive = radarsdf.simulate.SCENES[given.scene](frames=frames)
     out.mkdir(parents=True, exist_ok=True)
     scans_file, map_file = str(out / "scans.npz"), str(out / "map.safetensors")

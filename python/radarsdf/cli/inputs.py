@@ -18,7 +18,6 @@ from radarsdf.io.recordings import Request
 from radarsdf.map.map import Map
 from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import lacking, load
-from radarsdf.view.serving import free_port, require_viser
 
 MAP_SUFFIX = ".safetensors"
 
@@ -129,9 +128,3 @@ def inputs_of(given: Namespace) -> list[Path | None]:
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:
     return {name: getattr(given, name) for name in LIMITS}
-
-
-def check_address(given: Namespace) -> None:
-    """Raise an ImportError if viser is missing, an OSError if the address is unusable."""
-    require_viser()
-    free_port(given.host, given.port)

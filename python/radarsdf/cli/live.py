@@ -117,8 +117,7 @@ def live(given: Namespace, results: Results) -> None:
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
     request = request_of_topics(given)
     out, trajectory = given.out, given.trajectory
-    if trajectory is not None:
-        checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
+    checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
     check_outputs([out, trajectory, given.mcap, given.rrd], inputs_of(given))
     with ExitStack() as servers, ExitStack() as files:
         sinks, urls = _opened_sinks(given, servers, files)

@@ -115,8 +115,7 @@ def posed_scans(
 
 
 def calibrate(given: Namespace, results: Results) -> None:
-    if given.out is not None:
-        checked_suffix(given.out, (".json",), "mountings to write")
+    checked_suffix(given.out, (".json",), "mountings to write")
     check_outputs([given.out], inputs_of(given))
     found = radarsdf.calibrate(scans_or_unposed(given)[0], config=load_config(given))
     for note in found.notes:

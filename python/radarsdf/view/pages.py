@@ -139,7 +139,7 @@ class Viewer(Page):
             boxes = {name: gui.add_checkbox(name, True) for name in colors}
 
         async def on_scan(_: Any) -> None:
-            sensor = clouds.sensor(int(slider.value))
+            sensor = tuple(scans.sensor_poses[int(slider.value), :3, 3].tolist())
             if self._gizmo is not None:
                 self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
             self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=_SLID_S)

@@ -187,11 +187,6 @@ class ScanClouds:
         self.nodes: dict[str, Any] = {"trajectory": add_path(server, "/scans/path", path, path_color)}
         self.show(0)
 
-    def sensor(self, index: int) -> Position:
-        """Sensor position of a scan, world, m."""
-        x, y, z = self._scans[index].T_world_sensor[:3, 3].tolist()
-        return x, y, z
-
     def show(self, index: int) -> None:
         if index == self._shown:
             return
