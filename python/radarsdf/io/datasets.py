@@ -59,7 +59,6 @@ def _coloradar(folder: Path, request: Request) -> Scans:
 
 
 def _delft_folders(folder: Path) -> tuple[Path, Path]:
-    """Folders of the radar and of the lidar."""
     radar = folder.resolve() / ("training" if (folder / "training/velodyne").is_dir() else "radar/training")
     return radar, radar.parents[1] / "lidar/training"
 

@@ -290,10 +290,7 @@ _LIDAR_STREAM = 2**31  # no scan has this index
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Simulated radar scans with poses and ground truth.
-
-    There are F scans, with N_i returns in scan i.
-    """
+    """Simulated radar scans with poses and ground truth."""
 
     points: list[Floats32]  # F arrays (N_i, 3), sensor frame, m
     poses: Floats  # (F, 4, 4) T_world_sensor, m
