@@ -17,7 +17,7 @@ from radarsdf.io.read import read
 from radarsdf.io.recordings import Request
 from radarsdf.map.map import Map
 from radarsdf.scans import Notes, Scans
-from radarsdf.tiles.tiled_map import lacking, load
+from radarsdf.tiles.tiled_map import TiledMap, load
 
 MAP_SUFFIX = ".safetensors"
 
@@ -29,7 +29,8 @@ def is_map(path: Path) -> bool:
 
 def load_map(path: Path) -> Map:
     radar_map = load(path)
-    if tiles := lacking(radar_map):
+    if isinstance(radar_map, TiledMap) and (missing := radar_map.missing):
+        tiles = f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
         warn(f"warning: {path} lacks {tiles}: radarsdf tiles status {path} lists the reasons")
     return radar_map
 

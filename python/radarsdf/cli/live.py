@@ -130,8 +130,7 @@ def live(given: Namespace, results: Results) -> None:
             scans, unposed = scans_or_unposed(given, find=given.find)
             timed = len(scans.points) and (scans.times_s is not None or not unposed)
             check(timed, f"{given.scans}: scans without poses need times, one per scan")
-            if trajectory is not None:
-                check_pose_times(trajectory, scans.times_s)
+            check_pose_times(trajectory, scans.times_s)
         else:
             # Of the scans of hours of driving, memory holds only the last ones. /tmp may be memory.
             parent = None if out is None else out.absolute().parent

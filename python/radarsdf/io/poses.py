@@ -290,9 +290,9 @@ def read_calibration(path: Path) -> Floats | None:
         return check_pose(np.array([*numbers, 0, 0, 0, 1], np.float64).reshape(4, 4), "Tr")
 
 
-def check_pose_times(path: AnyPath, times_s: ArrayLike | None) -> None:
-    """Raise a ValueError if the format of the file needs times and there are none."""
-    possible = times_s is not None or path_of(path, "path").suffix.lower() != ".tum"
+def check_pose_times(path: AnyPath | None, times_s: ArrayLike | None) -> None:
+    """Raise a ValueError if the format of the file, if any, needs times and there are none."""
+    possible = times_s is not None or path is None or path_of(path, "path").suffix.lower() != ".tum"
     check(possible, f"{path} needs times, s, and there are none: .kitti and .npy do without")
 
 

@@ -6,8 +6,8 @@ from radarsdf.arrays import ArrayLike, Bytes, Floats, Floats32, Ints32, Mesh
 from radarsdf.checks import AnyPath, check, real_array
 from radarsdf.core import SurfaceTracer
 from radarsdf.io.files import write_whole
-from radarsdf.map.colors import NEUTRAL, intensity_colors
-from radarsdf.render.figures import Scale, new_figure, png_of
+from radarsdf.map.colors import NEUTRAL, Scale, intensity_colors
+from radarsdf.render.figures import new_figure, png_of
 from radarsdf.threads import resolve_num_threads
 
 _PIXELS_AT_ONCE = 1 << 20  # limit of memory

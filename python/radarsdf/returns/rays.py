@@ -52,9 +52,7 @@ class Rays:
     @property
     def with_intensity(self) -> Bools:
         """Mask (N,) of the returns with an intensity that is not an outlier."""
-        if self.intensities is None:
-            return np.zeros(len(self), np.bool_)
-        return ~np.isnan(self.intensities)
+        return np.zeros(len(self), np.bool_) if self.intensities is None else ~np.isnan(self.intensities)
 
     def rows_of_sensors(self) -> list[slice | Ints]:
         if self.sensor_of_scan is None:
@@ -238,9 +236,8 @@ def prepare(
     R, most_of_scan = T_world_sensor[:, :3, :3].reshape(-1, 9), np.where(rigid, most_m, -1.0)
     given = np.concatenate(scans), scan_of, R, positions - local_origin, seen_from - local_origin
     kept, points_m, directions, ranges_m = scan_rays(*given, min_range_m, most_of_scan, num_threads)
-    if len(ranges_m) == 0 and whole:
-        msg = f"none of {left_out.given} returns lies between {min_range_m} m and {most_m} m"
-        raise ValueError("; ".join([msg, *left_out.notes]))
+    none = f"none of {left_out.given} returns lies between {min_range_m} m and {most_m} m"
+    checks.check(len(ranges_m) or not whole, "; ".join([none, *left_out.notes]))
     for note in left_out.notes if whole else ():
         _LOG.warning(note)
     intensity = None if values is None else np.concatenate(values)[kept]

@@ -10,8 +10,8 @@ from radarsdf.arrays import Floats
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
 from radarsdf.checks import check
 from radarsdf.grids.grid import Grid
+from radarsdf.map.colors import SHARES
 from radarsdf.map.map import Map
-from radarsdf.render.figures import SHARES
 from radarsdf.scans import Scan, Scans
 from radarsdf.view.scene import SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_cloud, add_mesh, add_path
 from radarsdf.view.serving import CameraPose, Page, aim, framing_pose

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from radarsdf.arrays import Array, Bytes, Floats, Ints
-from radarsdf.map.colors import NEUTRAL
+from radarsdf.map.colors import NEUTRAL, Scale
 from radarsdf.map.map import Map
-from radarsdf.render.figures import Scale
 from radarsdf.scans import Scans
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
 from radarsdf.view.surface import Position, Quantity, ShownSurface, glb, lightness_of, shaded, spread_evenly

@@ -21,7 +21,7 @@ from radarsdf.extras import require
 from radarsdf.grids.grid import Grid
 from radarsdf.io.files import checked_suffix, whole_file
 from radarsdf.io.ros2 import Node, Subscription, encode, make_message
-from radarsdf.render.figures import Scale
+from radarsdf.map.colors import Scale
 from radarsdf.scans import Scan
 from radarsdf.view.serving import LOCALHOST, free_port
 

@@ -13,10 +13,10 @@ from radarsdf.arrays import Array, ArrayLike, Bools, Bytes, Floats, Floats32, In
 from radarsdf.checks import check
 from radarsdf.core import SurfaceTracer
 from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
+from radarsdf.map.colors import SHARES, Scale
 from radarsdf.map.map import Map
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
-from radarsdf.render.figures import SHARES, Scale
 
 Position = tuple[float, float, float]
 UNCERTAINTY = "uncertainty (standard error), m"
