@@ -12,8 +12,8 @@ from radarsdf import FitConfig, RadarMap
 from radarsdf.checks import check_box
 from radarsdf.evaluation import holdout
 from radarsdf.io import read
+from radarsdf.io.datasets import find_dataset
 from radarsdf.io.npz import read_scans
-from radarsdf.io.read import find_dataset
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.scans import Scans
 from radarsdf.simulate import SCENES, Simulation

@@ -9,7 +9,7 @@ import radarsdf
 
 ROOT = Path(radarsdf.__file__).parent
 BASE = [
-    "_core", "arrays", "checks", "extras", "interrupts", "lattice", "memory", "products", "rig", "scans", "settings", "threads",
+    "_core", "arrays", "checks", "core", "extras", "interrupts", "lattice", "memory", "products", "rig", "scans", "settings", "threads",
 ]  # fmt: skip
 # From the lowest to the highest. A subpackage may import itself and those before it; `io` is below `map`, which saves itself.
 METHOD = ["config", "returns", "field", "io", "map", "fitting"]
@@ -62,6 +62,11 @@ def graph():
 
 def test_every_subpackage_is_known():
     assert {name.split(".")[0] for name, _ in modules()} | {"_core"} == set(LEVEL)
+
+
+def test_one_module_imports_the_compiled_core():
+    """It imports PyTorch before: with an OpenMP runtime each, both start their own threads."""
+    assert [name for name, targets in graph().items() if "_core" in targets] == ["core"]
 
 
 def test_imports_go_downwards():

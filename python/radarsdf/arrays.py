@@ -1,10 +1,15 @@
-"""Types of arrays by the type of their numbers; docstrings state shapes and units."""
+"""Types of arrays by the type of their numbers, and of meshes; docstrings state shapes and units."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike as ArrayLike  # noqa: PLC0414 - for all modules
+from numpy.typing import NDArray as NDArray  # noqa: PLC0414 - for all modules
 
+if TYPE_CHECKING:
+    import trimesh  # takes long
+
+Mesh: TypeAlias = "trimesh.Trimesh"
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

@@ -6,13 +6,12 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats
 
 # Largest coordinate: squares of it, and products of three, are far from overflow in float64.
 MAX_POSITION_M = 1e12
@@ -64,8 +63,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:
         array = np.asarray(values)
         if array.dtype.kind == "O":  # numbers of other types, or integers with many digits
             array = array.astype(np.float64)
-    if array.dtype.kind not in "biuf":
-        raise _wrong_type(name, "real numbers", array.dtype)
+    _check_type(array.dtype.kind in "biuf", name, "real numbers", array.dtype)
     with np.errstate(over="ignore"):  # overflow becomes infinite, which callers refuse
         return array.astype(dtype, copy=False)
 
@@ -175,28 +173,25 @@ def are_rigid(poses: Floats) -> Bools:
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:
-    if not isinstance(value, kind):
-        raise _wrong_type(name, f"a {kind.__name__}", value)
-    return value
+    _check_type(isinstance(value, kind), name, f"a {kind.__name__}", value)
+    return cast(_Kind, value)
 
 
 def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
     """Return `values` if they are iterable, else raise a TypeError."""
     one_by_one = hasattr(values, "__iter__") or hasattr(values, "__getitem__")
-    if not one_by_one or getattr(values, "ndim", 1) == 0:
-        raise _wrong_type(name, "a list of arrays, one per scan", values)
-    return values
+    has_rows = one_by_one and getattr(values, "ndim", 1) != 0
+    _check_type(has_rows, name, "a list of arrays, one per scan", values)
+    return cast(Iterable[Any], values)
 
 
 def path_of(value: Any, name: str) -> Path:
-    if not isinstance(value, (str, os.PathLike)):
-        raise _wrong_type(name, "a path", value)
+    _check_type(isinstance(value, (str, os.PathLike)), name, "a path", value)
     return Path(value)
 
 
 def flag(value: Any, name: str) -> bool:
-    if not isinstance(value, (bool, np.bool_)):
-        raise _wrong_type(name, "True or False", value)
+    _check_type(isinstance(value, (bool, np.bool_)), name, "True or False", value)
     return bool(value)
 
 
@@ -212,8 +207,8 @@ def hides_bar(progress: bool | None) -> bool | None:
 
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:
     """Convert to an int, `lowest` ≤ value ≤ `highest`."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        raise _wrong_type(name, "a whole number", value)
+    is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    _check_type(is_whole, name, "a whole number", value)
     least = "positive" if lowest == 1 else f"at least {lowest}"
     check(lowest <= value <= highest, f"{name} must be {least} and at most {highest}, not {value!r:.50}")
     return int(value)
@@ -238,6 +233,6 @@ def _scalar(value: Any, name: str, wanted: str, fits: Callable[[float], bool]) -
     return float(array)
 
 
-def _wrong_type(name: str, wanted: str, value: Any) -> TypeError:
+def _check_type(holds: bool, name: str, wanted: str, value: Any) -> None:
     found = repr(value) if isinstance(value, (str, bytes, int, float, type(None))) else type(value).__name__
-    return TypeError(f"{name} must be {wanted}, not {found:.50}")
+    check(holds, f"{name} must be {wanted}, not {found:.50}", TypeError)

@@ -3,9 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import ArrayLike, Floats, Ints
 
 # Walls and floors often have a coordinate of zero or a round number. On a face between cells, noise would scatter the
 # returns of one wall to both sides. With this shift, no such plane is a face of cells of any size: a third of a block is a

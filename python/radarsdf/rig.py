@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Floats, Ints, Ints32
+from radarsdf.arrays import ArrayLike, Floats, Ints, Ints32
 from radarsdf.checks import are_rigid, check, check_pose, one_for_each_scan, real_array
 
 

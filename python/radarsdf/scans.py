@@ -9,9 +9,8 @@ from itertools import repeat
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Array, Bools, Floats, Ints
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Ints
 from radarsdf.checks import MISSING_POSES, check, one_for_each_scan, pose_matrices
 from radarsdf.rig import Imu, Label, Rig
 

@@ -19,7 +19,7 @@ import torch
 from torch.nn import functional
 from typing_extensions import Self
 
-from radarsdf import _core
+from radarsdf import core
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -27,9 +27,9 @@ _Result = TypeVar("_Result")
 _TRANSCENDENTAL = ("cos", "erf", "exp", "log", "log10", "log1p", "log2", "pow", "sigmoid", "sin", "tanh")
 _VECTOR_LENGTH = 1024  # elements: enough for vectors, too few for PyTorch to split among threads
 
-_wanted, _known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
+_wanted, _known = os.environ.get("RADARSDF_ISA"), core.available_instruction_sets()
 if _wanted and _wanted not in _known:  # the core keeps its own choice
-    used = f"{', '.join(_known)}: {_core.instruction_set()} is used"
+    used = f"{', '.join(_known)}: {core.instruction_set()} is used"
     warnings.warn(f"RADARSDF_ISA={_wanted!s:.50} is none of {used}", RuntimeWarning, stacklevel=2)
 
 
@@ -119,12 +119,12 @@ class ThreadPool:
                     torch.set_num_threads(self._threads_after)
 
     @cached_property
-    def core_threads(self) -> _core.ThreadPool:
+    def core_threads(self) -> core.ThreadPool:
         """Equally many threads of the core, for short work without Python: they spin for a moment before they sleep.
 
         On two threads, a training iteration took 4.1 ms with the pool, which was woken ten times, and takes 2.3 ms.
         """
-        return _core.ThreadPool(self.num_threads)
+        return core.ThreadPool(self.num_threads)
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
         """Like the built-in ``map``, with the items on different threads and gradients enabled.

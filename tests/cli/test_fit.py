@@ -133,7 +133,7 @@ def test_the_demo_opens_the_viewer_if_interactive(screen, tmp_path, monkeypatch)
     pytest.importorskip("viser", reason="the extra view is not installed")
     calls = []
     monkeypatch.setattr("radarsdf.view.serving.has_display", lambda: screen)
-    monkeypatch.setattr("radarsdf.cli.fits.show_map", lambda *_, **__: calls.append(1))
+    monkeypatch.setattr("radarsdf.cli.maps.view", lambda *_, **__: calls.append(1))
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     words = ["--scene", "wall", "--frames", 2, "-o", tmp_path, "--voxel", 0.4]
     assert call("demo", *words, *QUICK[:2]) == 0

@@ -5,9 +5,9 @@ import pytest
 import radarsdf
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.scans import Scans
-from radarsdf.simulate import drifted, measured_motion
+from radarsdf.simulate import drifted
 
-from ..poses.drift import first, position_error_m
+from ..poses.drift import first, measured, position_error_m
 from ..poses.test_odometry import errors
 from .calls import call, refusal, values
 
@@ -16,44 +16,28 @@ FEW = 12  # to locate
 
 
 @pytest.fixture(scope="module")
-def simulation():
+def drive():
     """The first scans of a drive."""
-    return first(radarsdf.simulate.oculii, FRAMES, seed=62, frames=120)
-
-
-@pytest.fixture(scope="module")
-def drive(simulation):
-    return Scans(simulation.points, simulation.poses, simulation.intensities)
-
-
-@pytest.fixture(scope="module")
-def motion(simulation):
-    """Measurements of their motion."""
-    return measured_motion(simulation)
+    return measured(first(radarsdf.simulate.oculii, FRAMES, seed=62, frames=120))
 
 
 @pytest.fixture
-def drifted_file(drive, motion, tmp_path):
+def drifted_file(drive, tmp_path):
     """Scans with drifting poses."""
     path = tmp_path / "drive.npz"
-    poses = drifted(drive.poses, 0.05, 0.004, 1)
-    speeds = motion.doppler_mps
-    write_scans(
-        path, Scans(drive.points, poses, drive.intensities, doppler_mps=speeds, times_s=motion.times_s)
-    )
+    write_scans(path, drive.with_poses(drifted(drive.poses, 0.05, 0.004, 1)))
     return path
 
 
 @pytest.fixture
-def unposed(drive, motion, tmp_path):
+def unposed(drive, tmp_path):
     """A folder of scans with Doppler and times, and no poses."""
     folder = tmp_path / "scans"
     folder.mkdir()
-    for scan, speeds, time_s in zip(drive.points, motion.doppler_mps, motion.times_s, strict=True):
-        table = np.column_stack([scan, speeds])
-        np.savetxt(
-            folder / f"{100 + time_s:.3f}.csv", table, delimiter=",", header="x,y,z,doppler", comments=""
-        )
+    for scan in drive:
+        table = np.column_stack([scan.points, scan.doppler_mps])
+        path = folder / f"{100 + scan.time_s:.3f}.csv"
+        np.savetxt(path, table, delimiter=",", header="x,y,z,doppler", comments="")
     return folder
 
 
@@ -99,20 +83,12 @@ def test_a_fit_refines_the_poses(drive, drifted_file, tmp_path, capsys):
     )
 
 
-def test_segments_are_not_joined(drive, motion, tmp_path, capsys):
-    other = radarsdf.simulate.wall(seed=63, frames=5)
-    later = measured_motion(other)
-    path = tmp_path / "two.npz"
-    write_scans(
-        path,
-        Scans(
-            drive.points + other.points,
-            np.tile(np.eye(4), (FRAMES + len(other.points), 1, 1)),
-            doppler_mps=motion.doppler_mps + later.doppler_mps,
-            times_s=np.r_[motion.times_s, later.times_s + 60],
-        ),
-    )
-    out = tmp_path / "poses.tum"
+def test_segments_are_not_joined(drive, tmp_path, capsys):
+    later = measured(radarsdf.simulate.wall(seed=63, frames=5))
+    path, out = tmp_path / "two.npz", tmp_path / "poses.tum"
+    poses, times_s = np.tile(np.eye(4), (FRAMES + 5, 1, 1)), np.r_[drive.times_s, later.times_s + 60]
+    of_motion = {"doppler_mps": drive.doppler_mps + later.doppler_mps, "times_s": times_s}
+    write_scans(path, Scans(drive.points + later.points, poses, **of_motion))
     assert call("poses", path, "--find", "-o", out) == 0
     said = capsys.readouterr().out
     assert f"the scans 0 to {FRAMES - 1} are used" in said
@@ -131,9 +107,8 @@ def test_outputs_are_checked_before_the_work(drive, drifted_file, tmp_path, caps
         assert named in refusal(capsys, tmp_path, *words)
 
 
-def test_scans_are_located_in_a_map(drive, motion, tmp_path, capsys):
-    scans = Scans(drive.points, drive.poses, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
-    write_scans(tmp_path / "drive.npz", scans.select(range(FEW)))
+def test_scans_are_located_in_a_map(drive, tmp_path, capsys):
+    write_scans(tmp_path / "drive.npz", drive.select(range(FEW)))
     config = radarsdf.FitConfig.quick()
     radarsdf.fit(drive.points, drive.poses, config=config, progress=False).save(tmp_path / "map.safetensors")
     out = tmp_path / "found.tum"
@@ -152,14 +127,12 @@ def test_scans_are_located_in_a_map(drive, motion, tmp_path, capsys):
     assert "guess" in refusal(capsys, tmp_path, "locate", *there, "-o", out, *near, yaw_deg + 180)
 
 
-def test_sessions_are_joined_in_a_folder(drive, motion, tmp_path, capsys):
+def test_sessions_are_joined_in_a_folder(drive, tmp_path, capsys):
     T = np.eye(4)
     T[:3, 3] = 50, -20, 1
     for name, part, world in (("a", slice(0, 16), np.eye(4)), ("b", slice(8, 24), T)):
-        times_s = motion.times_s[part]
-        write_scans(
-            tmp_path / f"{name}.npz", Scans(drive.points[part], world @ drive.poses[part], times_s=times_s)
-        )
+        scans = Scans(drive.points[part], world @ drive.poses[part], times_s=drive.times_s[part])
+        write_scans(tmp_path / f"{name}.npz", scans)
     found = values(capsys, "join", tmp_path / "a.npz", tmp_path / "b.npz", "-o", tmp_path / "joined")
     assert found["joined"] == ["a.npz", "b.npz"]
     joined = read_scans(tmp_path / "joined" / "b.npz")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.read import find_dataset
+from radarsdf.io.datasets import find_dataset
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose

@@ -1,7 +1,5 @@
 """Scans without poses are placed at their true poses, or rejected."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import radarsdf
@@ -12,25 +10,23 @@ from radarsdf.poses.rigid import aligned
 
 from scenes.kinds import KINDS
 
-from ..poses.drift import first, thinned
+from ..poses.drift import first, measured, thinned
 
 SETTINGS = FitConfig(num_threads=1)
 
 
 @pytest.fixture(scope="module")
 def drive():
-    scans = first(radarsdf.simulate.oculii, 25, seed=91, frames=60)
-    return scans, radarsdf.simulate.measured_motion(scans)
+    return measured(first(radarsdf.simulate.oculii, 25, seed=91, frames=60))
 
 
-def follow(live, scans, motion, rows, sign=1, most_mps=np.inf, **more):
+def follow(live, scans, rows, sign=1, most_mps=np.inf, added_mps=0.0, **more):
     for i in rows:
-        speeds = sign * np.asarray(motion.doppler_mps[i])
+        speeds = sign * scans.doppler_mps[i] + np.float32(added_mps)
         if np.isfinite(most_mps):
             speeds = (speeds + most_mps) % (2 * most_mps) - most_mps
-        done = live.integrate(
-            scans.points[i], doppler_mps=speeds, time_s=motion.times_s[i], scan_id=int(i), **more
-        )
+        given = {"doppler_mps": speeds, "time_s": scans.times_s[i], "scan_id": int(i)}
+        done = live.integrate(scans.points[i], **given | more)
     return done
 
 
@@ -43,52 +39,44 @@ def rms_m(live, true):
 
 @pytest.mark.parametrize(("sign", "most_mps"), [(1, np.inf), (-1, 4.0)])  # it drives at 7 m/s
 def test_scans_are_placed_at_their_true_poses(drive, sign, most_mps):
-    scans, motion = drive
     live = LiveMap(SETTINGS)
-    follow(live, scans, motion, range(16), sign, most_mps)
-    assert rms_m(live, scans.poses) < 0.015
+    follow(live, drive, range(16), sign, most_mps)
+    assert rms_m(live, drive.poses) < 0.015
     assert len(live.mesh().faces) > 2_000
 
 
 def test_a_drive_that_starts_fast_is_as_accurate_as_odometry():
     """Regression: errors of 3 to 16 m, or lost tracking, before first scans were placed again."""
-    seed = 11
-    scans = first(radarsdf.simulate.oculii, 12, seed=seed, frames=20)
-    motion = radarsdf.simulate.measured_motion(scans, seed=seed)
+    scans = measured(first(radarsdf.simulate.oculii, 12, seed=11, frames=20), seed=11)
     live = LiveMap(SETTINGS)
-    moved = [follow(live, scans, motion, [i], sign=-1).moved for i in range(12)]
+    moved = [follow(live, scans, [i], sign=-1).moved for i in range(12)]
     assert live._state.track.steps[-1].sign == -1
     assert moved[3] == (1, 2)
     assert moved[7] == (1, 2, 3, 4, 5, 6)
-    batch = radarsdf.odometry(
-        scans.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s, config=SETTINGS
-    )
-    assert rms_m(live, batch.poses) < 0.3
+    assert rms_m(live, radarsdf.odometry(scans, config=SETTINGS).poses) < 0.3
 
 
 @pytest.mark.parametrize("with_doppler", [True, False])
 def test_tracking_continues_from_given_poses(drive, with_doppler):
-    scans, motion = drive
     live = LiveMap(SETTINGS)
     with pytest.raises(ValueError, match="a pose, or a time"):
-        live.integrate(scans.points[0])
+        live.integrate(drive.points[0])
     for i in (*range(10), 9, 10, 11, 12):  # one of them twice
-        pose = scans.poses[i] if i < 10 else None
-        speeds = motion.doppler_mps[i] if with_doppler else None
-        done = live.integrate(scans.points[i], pose, doppler_mps=speeds, time_s=motion.times_s[i])
-    assert np.linalg.norm(done.pose[:3, 3] - scans.poses[12, :3, 3]) < 0.1
+        pose = drive.poses[i] if i < 10 else None
+        speeds = drive.doppler_mps[i] if with_doppler else None
+        done = live.integrate(drive.points[i], pose, doppler_mps=speeds, time_s=drive.times_s[i])
+    assert np.linalg.norm(done.pose[:3, 3] - drive.poses[12, :3, 3]) < 0.1
     without_times = LiveMap(SETTINGS)
-    without_times.integrate(scans.points[0], scans.poses[0])
+    without_times.integrate(drive.points[0], drive.poses[0])
     with pytest.raises(Lost, match="none with a time"):  # the next one does not begin at the origin again
-        follow(without_times, scans, motion, [1])
+        follow(without_times, drive, [1])
 
 
 def test_untrackable_scans_are_rejected_without_side_effects(drive):
-    scans, motion = drive
     live, other = LiveMap(SETTINGS), LiveMap(SETTINGS)
 
     def add(to, i, **changes):
-        scan = {"points": scans.points[i], "doppler_mps": motion.doppler_mps[i], "time_s": motion.times_s[i]}
+        scan = {"points": drive.points[i], "doppler_mps": drive.doppler_mps[i], "time_s": drive.times_s[i]}
         return to.integrate(**scan | changes)
 
     for i in range(4):
@@ -98,7 +86,7 @@ def test_untrackable_scans_are_rejected_without_side_effects(drive):
             add(live, i)
     noise = np.random.default_rng(0).uniform(-30, 30, (2000, 3))
     with pytest.raises(Lost, match="nowhere near"):  # a scan of clutter, after a gap in time
-        add(live, 4, points=noise, doppler_mps=None, time_s=motion.times_s[4] + 3)
+        add(live, 4, points=noise, doppler_mps=None, time_s=drive.times_s[4] + 3)
     assert add(live, 4).pose.tobytes() == add(other, 4).pose.tobytes()
 
 
@@ -121,70 +109,61 @@ def test_unobservable_motion_along_a_wall_is_rejected():
 
 def test_a_sensor_that_turns_fast_is_tracked():
     """Regression: dead-reckoned all along, it ended 4.7 m off after 8 scans."""
-    lap = thinned(first(KINDS["car_park"], 8, seed=13, frames=20), 3)  # 19 degrees a step
+    lap = measured(thinned(first(KINDS["car_park"], 8, seed=13, frames=20), 3), seed=13)  # 19 degrees a step
     live = LiveMap(SETTINGS)
-    follow(live, lap, radarsdf.simulate.measured_motion(lap, seed=13), range(8))
+    follow(live, lap, range(8))
     assert rms_m(live, lap.poses) < 0.3
 
 
 def test_doppler_that_returns_do_not_decide_is_assumed_and_noted(drive):
     """A tunnel, whose returns look alike after each step, and a moving radar whose Doppler is zero."""
-    tunnel = thinned(first(KINDS["tunnel"], 18, seed=12, frames=20), 4)
-    motion = radarsdf.simulate.measured_motion(tunnel, seed=12)
+    tunnel = measured(thinned(first(KINDS["tunnel"], 18, seed=12, frames=20), 4), seed=12)
     live = LiveMap(SETTINGS)
-    follow(live, tunnel, motion, range(9))
+    follow(live, tunnel, range(9))
     assert rms_m(live, tunnel.poses) < 0.5
-    assert follow(live, tunnel, motion, range(9, 18)).notes
-    scans, motion = drive
+    assert follow(live, tunnel, range(9, 18)).notes
     live = LiveMap(SETTINGS)
-    assert follow(live, scans, motion, range(12)).notes  # too few are compared
-    assert not follow(live, scans, motion, range(12, 18)).notes
-    added = dataclasses.replace(
-        motion, doppler_mps=[speeds + np.float32(0.5) for speeds in motion.doppler_mps]
-    )
+    assert follow(live, drive, range(12)).notes  # too few are compared
+    assert not follow(live, drive, range(12, 18)).notes
     with pytest.raises(Lost, match="m/s are added to that of all returns"):
-        follow(LiveMap(SETTINGS), scans, added, range(12))
-    stationary = dataclasses.replace(motion, doppler_mps=[0 * speeds for speeds in motion.doppler_mps])
-    assert follow(LiveMap(SETTINGS), scans, stationary, range(9)).notes
+        follow(LiveMap(SETTINGS), drive, range(12), added_mps=0.5)
+    assert follow(LiveMap(SETTINGS), drive, range(9), sign=0).notes
 
 
 def test_a_stationary_sensor_leaves_the_doppler_sign_undetermined(drive):
-    scans, motion = drive
     live, rng = LiveMap(SETTINGS), np.random.default_rng(0)
     for i in range(6):
-        noisy = scans.points[0] + rng.normal(0, 0.02, scans.points[0].shape)
-        live.integrate(noisy, doppler_mps=rng.normal(0, 0.05, len(noisy)), time_s=motion.times_s[i])
+        noisy = drive.points[0] + rng.normal(0, 0.02, drive.points[0].shape)
+        live.integrate(noisy, doppler_mps=rng.normal(0, 0.05, len(noisy)), time_s=drive.times_s[i])
         assert live._state.track.steps[-1].sign == 0
     for i in range(1, 14):
-        live.integrate(scans.points[i], doppler_mps=-motion.doppler_mps[i], time_s=motion.times_s[i] + 0.5)
+        live.integrate(drive.points[i], doppler_mps=-drive.doppler_mps[i], time_s=drive.times_s[i] + 0.5)
     assert live._state.track.steps[-1].sign == -1
 
 
 def test_the_next_scan_is_placed_relative_to_moved_scans(drive, tmp_path):
-    scans, motion = drive
-    T = np.linalg.inv(scans.poses[0]) @ scans.poses
+    T = np.linalg.inv(drive.poses[0]) @ drive.poses
     shift = np.eye(4)
     shift[:3, :3], shift[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [30.0, -20.0, 4.0]
     live = LiveMap(SETTINGS)
-    follow(live, scans, motion, range(8))
+    follow(live, drive, range(8))
     live.move_all({i: shift @ T[i] for i in range(8)})  # a closed loop
     live.save(tmp_path / "live.npz")
     loaded = LiveMap.load(tmp_path / "live.npz")
     for one in (live, loaded):
-        done = follow(one, scans, motion, [8])
+        done = follow(one, drive, [8])
         assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[8])[:3, 3]) < 0.1
     wrong = shift.copy()
     wrong[:3, 3] += [20.0, 0.0, 0.0]
-    live.integrate(scans.points[9], wrong @ T[9], time_s=motion.times_s[9], scan_id="bad")
+    live.integrate(drive.points[9], wrong @ T[9], time_s=drive.times_s[9], scan_id="bad")
     live.remove("bad")
-    done = follow(live, scans, motion, [9])
+    done = follow(live, drive, [9])
     assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[9])[:3, 3]) < 0.1
 
 
 def test_a_loop_is_closed_and_tracking_continues(tmp_path):
     """The lap ended 0.56 m off."""
-    lap = KINDS["hall"](seed=2)
-    motion, refine = radarsdf.simulate.measured_motion(lap, seed=2), live_map.refine_poses
+    lap, refine = measured(KINDS["hall"](seed=2), seed=2), live_map.refine_poses
     live = LiveMap(SETTINGS, folder=tmp_path / "folder")
 
     def end_m(one):
@@ -192,12 +171,12 @@ def test_a_loop_is_closed_and_tracking_continues(tmp_path):
         return np.linalg.norm(off[:3, 3])
 
     def refine_meanwhile(*scans, **options):
-        follow(live, lap, motion, [79])
+        follow(live, lap, [79])
         return refine(*scans, **options)
 
-    follow(live, lap, motion, range(50))
+    follow(live, lap, range(50))
     assert len(live.close_loops()) == 0  # no place was revisited
-    follow(live, lap, motion, range(50, 79))
+    follow(live, lap, range(50, 79))
     live.save(tmp_path / "live.npz")
     loaded, first = LiveMap.load(tmp_path / "live.npz"), live.pose(0)
     assert end_m(live) > 0.3
@@ -205,7 +184,7 @@ def test_a_loop_is_closed_and_tracking_continues(tmp_path):
         patch.setattr(live_map, "refine_poses", refine_meanwhile)
         assert len(live.close_loops()) > 1000
     loaded.close_loops()
-    follow(loaded, lap, motion, [79])
+    follow(loaded, lap, [79])
     for one in (live, loaded):
         assert end_m(one) < 0.1
         assert (one.pose(0) == first).all()

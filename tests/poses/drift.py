@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from radarsdf.io import Scans
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.simulate import RadarSensor, SimulatedScan
+from radarsdf.simulate import RadarSensor, SimulatedScan, measured_motion
 from scipy.spatial.transform import Rotation
 
 
@@ -62,6 +63,13 @@ def first(drive, count, *given, **named):
         for name in ("points", "poses", "intensities", "noiseless_intensities", "origin_kind")
     }
     return dataclasses.replace(simulation, **of_scans)
+
+
+def measured(drive, **options):
+    """Scans of a simulation with the times and the Doppler of `measured_motion`."""
+    motion = measured_motion(drive, **options)
+    of_motion = {"doppler_mps": motion.doppler_mps, "times_s": motion.times_s}
+    return Scans(drive.points, drive.poses, drive.intensities, **of_motion)
 
 
 def thinned(simulation, every):

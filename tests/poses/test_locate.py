@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.io import Scans
 from radarsdf.poses.rigid import increments, moved
-from radarsdf.simulate import hugin, measured_motion
+from radarsdf.simulate import hugin
 
 from scenes.kinds import KINDS
 from scenes.revisits import SYMMETRIC, another_day, sessions, weaker
 
 from ..conftest import recorded_file
 from .drift import first as first_scans
+from .drift import measured
 
 FEW = 12  # scans, of the 24 of another day: enough for two submaps
 
@@ -21,19 +21,8 @@ def fitted(first):
     return radarsdf.fit(first.points, first.poses, config=FitConfig.quick(), progress=False)
 
 
-def measured(day, frames=slice(None)):
-    """Arguments of odometry for some of the scans."""
-    motion = measured_motion(day)
-    return {
-        "points": day.points[frames],
-        "doppler_mps": motion.doppler_mps[frames],
-        "times_s": motion.times_s[frames],
-    }
-
-
-def located(radar_map, day, frames=slice(None), **more):
-    scans = measured(day, frames)
-    return radarsdf.locate(radar_map, scans.pop("points"), **scans, **more)
+def located(radar_map, day, count=None, **more):
+    return radarsdf.locate(radar_map, measured(day).select(range(len(day))[:count]), **more)
 
 
 def errors(found, true):
@@ -96,7 +85,7 @@ def test_a_saved_map_and_a_turned_world(first, day, tmp_path):
     T = moved(np.eye(4), np.array([5e5, 5.4e6, 300.0, 0, 0, 2.0]))
     turned = radarsdf.fit(first.points, T @ first.poses, config=FitConfig.quick(), progress=False)
     turned.save(tmp_path / "map.safetensors")
-    found = located(radarsdf.load(tmp_path / "map.safetensors"), day, slice(FEW))
+    found = located(radarsdf.load(tmp_path / "map.safetensors"), day, FEW)
     assert np.median(errors(found.poses, T @ day.poses[:FEW])[0]) < 0.05
 
 
@@ -143,7 +132,7 @@ def test_a_guess_replaces_the_search():
     day = another_day(tunnel, 2)
     index = radarsdf.SurfaceIndex.of(fitted(tunnel))
     with pytest.raises(radarsdf.Lost):
-        located(index, day, slice(FEW))
+        located(index, day, FEW)
     found = located(index, day, guess=moved(day.poses[0], NEAR))
     off = np.abs(increments(day.poses, found.poses)[:, :3])
     sigmas = np.sqrt(np.einsum("fii->fi", found.covariance)[:, :3])
@@ -152,16 +141,16 @@ def test_a_guess_replaces_the_search():
 
 
 def test_a_wrong_guess_is_refused(index, day):
-    right = located(index, day, slice(FEW), guess=moved(day.poses[0], NEAR))
+    right = located(index, day, FEW, guess=moved(day.poses[0], NEAR))
     assert np.median(errors(right.poses, day.poses[:FEW])[0]) < 0.05
     for off in ([15.0, 0, 0, 0, 0, 0], [0, -8.0, 0, 0, 0, 0.5], [0, 0, 0, 0, 0, 3.0]):
         with pytest.raises(radarsdf.Lost, match="guess"):
-            located(index, day, slice(6), guess=moved(day.poses[0], np.array(off)))
+            located(index, day, 6, guess=moved(day.poses[0], np.array(off)))
 
 
 def test_a_guess_that_returns_do_not_confirm_is_not_sure(index, elsewhere):
     guess = moved(elsewhere.poses[0], np.array([30.0, 0, 0, 0, 0, 0]))
-    one = located(index, elsewhere, slice(1), guess=guess)
+    one = located(index, elsewhere, 1, guess=guess)
     for found in (located(index, elsewhere, guess=guess), one):
         assert any("guess" in note for note in found.report["notes"])
         assert (np.sqrt(np.einsum("fii->fi", found.covariance)[:, :2]) >= 0.5).all()
@@ -169,10 +158,10 @@ def test_a_guess_that_returns_do_not_confirm_is_not_sure(index, elsewhere):
 
 def test_a_kidnapped_radar_is_found_again(first, index):
     early, late = (first_scans(another_day, FEW, first, 1, stretch=s) for s in ((0.0, 0.3), (0.7, 1.0)))
-    parts = [measured(one) for one in (early, late)]
-    points, speeds = ([*parts[0][name], *parts[1][name]] for name in ("points", "doppler_mps"))
-    times_s = np.concatenate([parts[0]["times_s"], parts[0]["times_s"][-1] + 0.1 + parts[1]["times_s"]])
-    found = radarsdf.locate(index, points, doppler_mps=speeds, times_s=times_s)
+    one, other = measured(early), measured(late)
+    times_s = np.concatenate([one.times_s, one.times_s[-1] + 0.1 + other.times_s])
+    speeds = one.doppler_mps + other.doppler_mps
+    found = radarsdf.locate(index, one.points + other.points, doppler_mps=speeds, times_s=times_s)
     true = np.concatenate([early.poses, late.poses])
     known = found.segments >= 0
     assert errors(found.poses[known], true[known])[0].max() < 0.5
@@ -185,9 +174,8 @@ def test_sessions_are_joined_or_apart():
     of_place = sessions("hugin", 4)
 
     def scans(day, posed):
-        motion = measured_motion(day)
         poses = day.poses if posed else np.full((len(day), 4, 4), np.nan)
-        return Scans(day.points, poses, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+        return measured(day).with_poses(poses)
 
     together = [scans(day, posed=i == 0) for i, day in enumerate(of_place.together)]
     found = radarsdf.join(together)
@@ -216,19 +204,14 @@ def test_the_second_arc_of_a_recorded_roundabout():
 
 def test_a_live_map_of_another_session_finds_the_radar(first, day, tmp_path):
     live = radarsdf.LiveMap()
-    scans = measured(first)
-    for points, pose, speeds, time_s in zip(
-        scans["points"], first.poses, scans["doppler_mps"], scans["times_s"], strict=True
-    ):
-        live.integrate(points, pose, doppler_mps=speeds, time_s=time_s)
+    for scan in measured(first):
+        live.integrate(scan.points, scan.T_world_sensor, doppler_mps=scan.doppler_mps, time_s=scan.time_s)
     live.save(tmp_path / "live.npz")
     live = radarsdf.LiveMap.load(tmp_path / "live.npz")
-    later = measured(day)
     lost, off_m = 0, []
-    for i, points in enumerate(later["points"]):
-        given = {"doppler_mps": later["doppler_mps"][i], "time_s": 86_400 + later["times_s"][i]}
+    for i, scan in enumerate(measured(day)):
         try:
-            found = live.integrate(points, **given)
+            found = live.integrate(scan.points, doppler_mps=scan.doppler_mps, time_s=86_400 + scan.time_s)
         except radarsdf.Lost:
             lost += 1
             continue

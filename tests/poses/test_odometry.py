@@ -11,7 +11,7 @@ from radarsdf.simulate import drifted, measured_motion
 from scenes.kinds import KINDS
 
 from ..conftest import recorded_file
-from .drift import first, normalised_errors, position_error_m, thinned
+from .drift import first, measured, normalised_errors, position_error_m, thinned
 
 BIAS_RAD_S = (0.01, -0.02, 0.03)
 
@@ -25,6 +25,11 @@ def drive():
 @pytest.fixture(scope="module")
 def motion(drive):
     return measured_motion(drive, gyroscope_bias_rad_s=BIAS_RAD_S)
+
+
+@pytest.fixture(scope="module")
+def scans(drive):
+    return measured(drive, gyroscope_bias_rad_s=BIAS_RAD_S)
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +52,6 @@ def errors(poses, true):
     return position_error_m(at, true), float(np.sqrt((turned_by(at, true) ** 2).mean()))
 
 
-def only(drive, rows):
-    """Some scans of a simulation."""
-    return [drive.points[i] for i in rows], drive.poses[rows]
-
-
 def test_returns_alone_are_not_counted_twice():
     """Steps tracked by the same returns are not independent evidence: NEES / 3 was 8 and more."""
     street = first(radarsdf.simulate.oculii, 20, seed=6, frames=30)
@@ -68,26 +68,21 @@ def test_errors_of_tracked_steps_do_not_persist():
 
 def test_damped_rolls_are_not_expected():
     """A motion prior of tracked rates, which returns hardly measure, left 0.6 degrees."""
-    lap = first(radarsdf.simulate.oculii, 70, seed=2)
-    motion = measured_motion(lap, seed=2)
-    found = radarsdf.odometry(lap.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
-    assert errors(found.poses, lap.poses)[1] < np.radians(0.5)
+    lap = measured(first(radarsdf.simulate.oculii, 70, seed=2), seed=2)
+    assert errors(radarsdf.odometry(lap).poses, lap.poses)[1] < np.radians(0.5)
 
 
 def test_a_scan_without_a_clear_match_is_not_lost_if_its_velocity_is_known():
-    street = radarsdf.simulate.astyx(seed=6)
-    motion = measured_motion(street, seed=6)
-    found = radarsdf.odometry(street.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+    street = measured(radarsdf.simulate.astyx(seed=6), seed=6)
+    found = radarsdf.odometry(street)
     assert found.report["segments"] == 1
     assert errors(found.poses, street.poses)[0] < 0.04  # 0.018 to 0.030 after changes of the points by 1e-7 m
 
 
 def test_planes_of_few_returns_are_coarse():
     """Regression: fine planes hardly constrained steps of 15 degrees, and the prior flattened them: an error of 0.5 m."""
-    hall = KINDS["hall"](seed=1, frames=24)
-    motion = measured_motion(hall, seed=1)
-    found = radarsdf.odometry(hall.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
-    assert errors(found.poses, hall.poses)[0] < 0.1
+    hall = measured(KINDS["hall"](seed=1, frames=24), seed=1)
+    assert errors(radarsdf.odometry(hall).poses, hall.poses)[0] < 0.1
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("car_park", 5), ("hall", 4)])
@@ -113,64 +108,51 @@ def test_errors_agree_with_the_covariance(drive, found):
     assert 0.2 < np.mean(normalised_errors(found, drive.poses)) < 5
 
 
-def test_a_gyroscope_measures_rotations_and_its_bias_is_estimated(drive, motion, found):
-    with_it = radarsdf.odometry(
-        drive.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s, imu=gyroscope(motion)
-    )
+def test_a_gyroscope_measures_rotations_and_its_bias_is_estimated(drive, motion, scans, found):
+    with_it = radarsdf.odometry(scans, imu=gyroscope(motion))
     assert errors(with_it.poses, drive.poses)[1] < errors(found.poses, drive.poses)[1]
     np.testing.assert_allclose(with_it.report["gyroscope_bias"], BIAS_RAD_S, atol=0.006)
     assert with_it.report["gyroscope"]
 
 
-def test_the_sign_and_the_folds_of_the_doppler_do_not_matter(drive, motion):
-    folded = measured_motion(drive, interval_mps=6.0, gyroscope_bias_rad_s=BIAS_RAD_S)
+def test_the_sign_and_the_folds_of_the_doppler_do_not_matter(drive):
+    folded = measured(drive, interval_mps=6.0, gyroscope_bias_rad_s=BIAS_RAD_S).select(range(20))
     assert max(np.abs(speeds).max() for speeds in folded.doppler_mps) <= 3.0 + 1e-6
-    points, true = only(drive, range(20))
-    turned = radarsdf.odometry(
-        points, doppler_mps=[-speeds for speeds in folded.doppler_mps[:20]], times_s=motion.times_s[:20]
-    )
+    turned = radarsdf.odometry(folded, doppler_mps=[-speeds for speeds in folded.doppler_mps])
     assert turned.report["doppler_sign"] == -1
-    assert errors(turned.poses, true)[0] < 0.005 * length_m(true)
+    assert errors(turned.poses, folded.poses)[0] < 0.005 * length_m(folded.poses)
 
 
-def test_a_gap_is_bridged(drive, motion):
-    rows = np.r_[0:12, 18:28]
-    points, true = only(drive, rows)
-    found = radarsdf.odometry(
-        points, doppler_mps=[motion.doppler_mps[i] for i in rows], times_s=motion.times_s[rows]
-    )
+def test_a_gap_is_bridged(scans):
+    parts = scans.select(np.r_[0:12, 18:28])
+    found = radarsdf.odometry(parts)
     assert found.report["segments"] == 1
-    assert errors(found.poses, true)[0] < 0.005 * length_m(true)
+    assert errors(found.poses, parts.poses)[0] < 0.005 * length_m(parts.poses)
 
 
 def test_a_discontinuous_drive_has_two_segments(drive):
-    other = first(radarsdf.simulate.hugin, 10, seed=63, frames=20)
-    motions = [measured_motion(scene) for scene in (drive, other)]
-    found = radarsdf.odometry(
-        drive.points[:12] + other.points,
-        doppler_mps=motions[0].doppler_mps[:12] + motions[1].doppler_mps,
-        times_s=np.r_[motions[0].times_s[:12], motions[1].times_s + 60],
-    )
+    other = measured(first(radarsdf.simulate.hugin, 10, seed=63, frames=20))
+    before = measured(drive).select(range(12))
+    times_s, speeds = np.r_[before.times_s, other.times_s + 60], before.doppler_mps + other.doppler_mps
+    found = radarsdf.odometry(before.points + other.points, doppler_mps=speeds, times_s=times_s)
     assert found.segments.tolist() == [0] * 12 + [1] * 10
     assert "lost before the scans 12: 2 segments" in found.report["verdict"]
     assert found.longest_segment() == slice(0, 12)
     assert errors(found.poses[12:], other.poses)[0] < 0.1
 
 
-def test_scans_suffice_if_they_observe_the_motion(drive, motion):
-    points, true = only(drive, range(20))
-    found = radarsdf.odometry(points, times_s=motion.times_s[:20])
+def test_scans_suffice_if_they_observe_the_motion(scans):
+    part = scans.select(range(20))
+    found = radarsdf.odometry(part.points, times_s=part.times_s)
     assert not found.report["doppler"]
-    assert errors(found.poses, true)[0] < 0.01 * length_m(true)
+    assert errors(found.poses, part.poses)[0] < 0.01 * length_m(part.poses)
 
 
 def test_a_single_wall_is_rejected():
-    wall = first(radarsdf.simulate.wall, 14, seed=5, frames=40)
+    wall = measured(first(radarsdf.simulate.wall, 14, seed=5, frames=40))
     with pytest.raises(ValueError, match="returns alone do not observe"):
         radarsdf.odometry(wall.points, times_s=np.arange(14) / 10)
-    motion = measured_motion(wall)
-    found = radarsdf.odometry(wall.points, times_s=motion.times_s, doppler_mps=motion.doppler_mps)
-    assert errors(found.poses, wall.poses)[0] < 0.05
+    assert errors(radarsdf.odometry(wall).poses, wall.poses)[0] < 0.05
 
 
 def test_a_pattern_that_moves_with_the_sensor_is_not_evidence_of_standing():
@@ -190,16 +172,9 @@ def test_too_few_returns_of_a_turning_sensor_are_rejected(drive, motion):
     assert found.report["length_m"] == pytest.approx(length_m(drive.poses), rel=0.05)
 
 
-def test_the_bits_do_not_depend_on_threads(drive, motion):
-    one, three = (
-        radarsdf.odometry(
-            drive.points[:8],
-            doppler_mps=motion.doppler_mps[:8],
-            times_s=motion.times_s[:8],
-            config=FitConfig(num_threads=threads),
-        )
-        for threads in (1, 3)
-    )
+def test_the_bits_do_not_depend_on_threads(scans):
+    part, settings = scans.select(range(8)), [FitConfig(num_threads=threads) for threads in (1, 3)]
+    one, three = (radarsdf.odometry(part, config=config) for config in settings)
     np.testing.assert_array_equal(one.poses, three.poses)
     np.testing.assert_array_equal(one.covariance, three.covariance)
 

@@ -20,7 +20,7 @@ from radarsdf.simulate import drifted
 
 from scenes.kinds import KINDS
 
-from .drift import normalised_errors, position_error_m
+from .drift import measured, normalised_errors, position_error_m
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +36,10 @@ def refined(street):
 def test_drift_is_removed(street, refined):
     given = drifted(street.poses, 0.05, 0.004, 1)
     assert refined.improved
-    before, after = (
-        position_error_m(aligned(poses, street.poses), street.poses) for poses in (given, refined.poses)
-    )
+    both = [aligned(poses, street.poses) for poses in (given, refined.poses)]
+    before, after = (position_error_m(poses, street.poses) for poses in both)
     assert after < 0.7 * before
-    turns = [
-        np.sqrt((turned_by(aligned(p, street.poses), street.poses) ** 2).mean())
-        for p in (given, refined.poses)
-    ]
+    turns = [np.sqrt((turned_by(poses, street.poses) ** 2).mean()) for poses in both]
     assert turns[1] < 0.9 * turns[0]
     assert 0.03 < refined.report["sigma_m"] < 0.07
     assert 0.001 < refined.report["sigma_rad"] < 0.008
@@ -182,23 +178,20 @@ def test_wrong_arguments_are_refused(street):
 
 
 def test_unusable_scans_are_excluded():
-    scans = radarsdf.simulate.wall(frames=12)
-    motion = radarsdf.simulate.measured_motion(scans)
-    points, speeds, poses = list(scans.points), list(motion.doppler_mps), scans.poses.copy()
+    scans = measured(radarsdf.simulate.wall(frames=12))
+    points, speeds, poses = list(scans.points), list(scans.doppler_mps), scans.poses.copy()
     points[2], speeds[2], poses[5] = points[2][:0], speeds[2][:0], np.nan
-    refined = radarsdf.refine_poses(points, poses, doppler_mps=speeds, times_s=motion.times_s)
+    refined = radarsdf.refine_poses(points, poses, doppler_mps=speeds, times_s=scans.times_s)
     assert np.linalg.norm(refined.poses[5, :3, 3] - scans.poses[5, :3, 3]) < 0.5
     assert [note.count("scan 2") + 2 * note.count("scan 5") for note in refined.report["notes"]] == [1, 2]
-    found = radarsdf.odometry(points, doppler_mps=speeds, times_s=motion.times_s)
+    found = radarsdf.odometry(points, doppler_mps=speeds, times_s=scans.times_s)
     assert np.isfinite(found.poses).all()
     assert "1 scans without returns (the first is scan 2)" in found.report["notes"][0]
 
 
 def test_zero_doppler_does_not_contract_true_poses():
-    drive = radarsdf.simulate.hugin(seed=8, frames=16)
-    motion = radarsdf.simulate.measured_motion(drive)
-    speeds = [0 * v for v in motion.doppler_mps]
-    found = radarsdf.refine_poses(drive.points, drive.poses, doppler_mps=speeds, times_s=motion.times_s)
+    drive = measured(radarsdf.simulate.hugin(seed=8, frames=16))
+    found = radarsdf.refine_poses(drive, doppler_mps=[0 * speeds for speeds in drive.doppler_mps])
     np.testing.assert_array_equal(found.poses, drive.poses)
     assert "not measured" in found.report["notes"][0] or "no motion" in found.report["notes"][0]
 
@@ -224,12 +217,11 @@ def test_contracted_scans_have_no_better_agreement():
     drive = KINDS["tunnel"](seed=8, frames=16)
     returns = SensorReturns.of(drive.points, 0.1, None)
     held = np.random.default_rng(0).random(len(returns)) < 0.2
+    parts, noise = (returns.select(held), returns.select(~held)), SensorNoise(0.1, 0.01, 0.01)
     for share in (0.0, 0.5):  # fraction of the distance driven
         after = drive.poses.copy()
         after[:, :3, 3] *= share
-        verdict = Verdict.of(
-            returns.select(held), returns.select(~held), drive.poses, after, SensorNoise(0.1, 0.01, 0.01)
-        )
+        verdict = Verdict.of(*parts, drive.poses, after, noise)
         assert verdict.mean > 0  # caused by density alone
         assert not verdict.improved
 
@@ -270,9 +262,8 @@ def test_the_verdict_is_saved_with_the_map():
 
 def test_normals_of_a_wall_do_not_point_along_it():
     rng = np.random.default_rng(0)
-    wall = np.column_stack(
-        [rng.normal(5, 0.05, 20_000), rng.uniform(-6, 6, 20_000), rng.uniform(-1, 2, 20_000)]
-    )
+    n = 20_000
+    wall = np.column_stack([rng.normal(5, 0.05, n), rng.uniform(-6, 6, n), rng.uniform(-1, 2, n)])
     surfels = Surfels.of(SensorReturns.of([wall], 0.0, None).posed(np.eye(4)[None]), 0.2)
     flat = surfels.is_flat()
     along, observed = surfels.normals[flat, 1], unbiased_normals(surfels, 1)[flat, 1]
@@ -286,11 +277,9 @@ def test_a_noisy_scan_has_an_unbiased_height(height_m):
     rng = np.random.default_rng(3)
     poses = np.tile(np.eye(4), (10, 1, 1))
     poses[:, 0, 3] = 0.2 * np.arange(10)
-    noises_m = np.tile([0.02, 0.15], 5)
-    scans = [
-        np.column_stack([rng.uniform(-3, 3, (3000, 2)), rng.normal(height_m, noise_m, 3000)])
-        for noise_m in noises_m
-    ]
+    scans = []
+    for noise_m in np.tile([0.02, 0.15], 5):
+        scans.append(np.column_stack([rng.uniform(-3, 3, (3000, 2)), rng.normal(height_m, noise_m, 3000)]))
     returns = SensorReturns.of(scans, 0.0, None)
     planes, _ = common_planes(returns, poses, 10, 0.4, None, ReturnsConfig(), 1)
     weak = np.tile(np.eye(6), (10, 1, 1, 1))

@@ -18,7 +18,7 @@ from radarsdf.simulate import measured_motion
 
 from scenes.kinds import KINDS
 
-from .drift import first, position_error_m, thinned
+from .drift import first, measured, position_error_m, thinned
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +94,9 @@ def test_doppler_of_other_scans_is_excluded(slope, late, named):
     assert named in note
 
 
-def test_too_few_scans_do_not_measure_the_scale_of_the_doppler(drive, motion):
+def test_too_few_scans_do_not_measure_the_scale_of_the_doppler(drive):
     """Regression: it counted as confirmed."""
-    found = radarsdf.odometry(
-        drive.points[:5], doppler_mps=motion.doppler_mps[:5], times_s=motion.times_s[:5]
-    )
+    found = radarsdf.odometry(measured(drive).select(range(5)))
     assert found.report["doppler"]
     assert any("the Doppler is in m/s" in note for note in found.report["notes"])
 
@@ -123,12 +121,12 @@ def test_an_implausible_gyroscope_bias_is_named(bias_rad_s, named):
     turns = 0.02 * rng.standard_normal((40, 3))
     rates = Gyroscope.of(np.zeros((41, 3)), np.arange(41) / 10, np.arange(41) / 10)
     shown = [MotionRate(10 * turn, 1e-4 * np.eye(3)) for turn in turns]
-    measured = dataclasses.replace(rates, turns=turns + [0, 0, bias_rad_s / 10])
+    measured_rates = dataclasses.replace(rates, turns=turns + [0, 0, bias_rad_s / 10])
     if named is None:
-        assert measured.learnt(shown).bias.mean[2] == pytest.approx(bias_rad_s, rel=0.1)
+        assert measured_rates.learnt(shown).bias.mean[2] == pytest.approx(bias_rad_s, rel=0.1)
         return
     with pytest.raises(UnusableGyroscopeError, match=named):
-        measured.learnt(shown)
+        measured_rates.learnt(shown)
 
 
 def test_a_gap_of_a_day_starts_a_new_segment(drive, motion):

@@ -35,7 +35,7 @@ def server(monkeypatch):
         scene=scene, initial_camera=SimpleNamespace(), atomic=nullcontext, shown=shown, texts=texts
     )
     server.gui = SimpleNamespace(add_html=lambda text: texts.append(text) or SimpleNamespace(content=text))
-    monkeypatch.setattr(serving, "require_viser", lambda: None)
+    monkeypatch.setattr(serving, "page_port", serving.free_port)
     monkeypatch.setattr(serving, "start_server", lambda *_: server)
     monkeypatch.setattr(serving, "stop_server", lambda _: None)
     return server

@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import mesh_components
-from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
+from radarsdf.arrays import ArrayLike, Bytes, Floats, Floats32, Ints32, NDArray
 from radarsdf.changes.alignment import Alignment, align
 from radarsdf.changes.probability import Differences, Errors, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.checks import AnyPath, check, check_box, instance, path_of
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import mesh_components
 from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_free_space
 from radarsdf.io.meshes import write_mesh

@@ -257,8 +257,6 @@ _MIN_VIEWS = 100  # needed to determine the units
 
 @dataclass(frozen=True)
 class _Means:
-    """Values at places, each with a variance."""
-
     points: Floats  # (K, 3) common frame, m
     values: Floats  # (K,) sensor units
     variances: Floats  # (K,) from the number of returns per mean

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Ints
+from radarsdf.arrays import ArrayLike, Ints
 from radarsdf.checking import frames, noise, trajectory
 from radarsdf.checking.doppler import check_doppler, check_mountings, misread_radars
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input

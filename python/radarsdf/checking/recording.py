@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from radarsdf import checks
-from radarsdf.arrays import Array, Floats
+from radarsdf.arrays import Array, ArrayLike, Floats
 from radarsdf.scans import Scans
 
 Severity = Literal["error", "warning", "note"]

@@ -7,11 +7,8 @@ from collections.abc import Callable
 from importlib.util import find_spec
 
 import radarsdf
-from radarsdf import Interrupted, RadarMap
-from radarsdf.cli import Results
+from radarsdf.cli import Results, maps
 from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, scans_or_unposed, split, without_intensities
-from radarsdf.cli.maps import add_report, evaluate, mesh
-from radarsdf.cli.maps import view as show_map
 from radarsdf.cli.options import LIMITS, Parser, refuse_if
 from radarsdf.cli.scans import posed_scans, warn_or_refuse
 from radarsdf.cli.settings import load_config
@@ -46,7 +43,7 @@ def fit(given: Namespace, results: Results) -> None:
         warn_or_refuse(used)
     try:
         radar_map = radarsdf.fit(used, config=config, progress=results.progress, checkpoint=given.checkpoint)
-    except Interrupted as stop:
+    except radarsdf.Interrupted as stop:
         if stop.radar_map is not None:
             stop.radar_map.save(out)
             stop.args = (f"{stop}; the map so far is in {out}",)
@@ -63,10 +60,10 @@ def fit(given: Namespace, results: Results) -> None:
     if report is not None:
         findings = radarsdf.check(every_scan, config=radar_map.config)
         subject = Subject(radar_map, out.name, scans, held_out, findings, progress=results.progress)
-        add_report(results, report, subject)
+        maps.add_report(results, report, subject)
 
 
-def _add_fit(results: Results, radar_map: RadarMap) -> None:
+def _add_fit(results: Results, radar_map: radarsdf.RadarMap) -> None:
     report = radar_map.report
     names = ("scans", "returns", "returns_used", "moving", "ghosts", "intensity_outliers", "leaf_cells")
     scans, returns, used, moving, ghosts, outliers, _ = (report[name] for name in names)
@@ -93,7 +90,7 @@ def demo(given: Namespace, results: Results) -> None:
         in_terminal = sys.stdout is not None and sys.stdout.isatty() and not results.json
         view = in_terminal and serving.has_display() and find_spec("viser") is not None
     elif view:
-        serving.require_viser()
+        serving.page_port(serving.LOCALHOST, None)
     drive = radarsdf.simulate.SCENES[given.scene](frames=frames)
     out.mkdir(parents=True, exist_ok=True)
     scans_file, map_file = str(out / "scans.npz"), str(out / "map.safetensors")
@@ -109,10 +106,10 @@ def demo(given: Namespace, results: Results) -> None:
     picture = ["--picture", str(out / "picture.png")] if find_spec("matplotlib") else []
     viewpoint = [f"{x:.1f}" for x in drive.poses[len(drive.poses) // 2, :3, 3]]
     run(fit, "fit", scans_file, "-o", map_file, "--holdout", "10")
-    run(mesh, "mesh", map_file, "-o", str(out / "mesh.ply"), "--viewpoint", *viewpoint, *picture)
-    run(evaluate, "eval", map_file, scans_file, "--holdout", "10", "--samples", "1000000")
+    run(maps.mesh, "mesh", map_file, "-o", str(out / "mesh.ply"), "--viewpoint", *viewpoint, *picture)
+    run(maps.evaluate, "eval", map_file, scans_file, "--holdout", "10", "--samples", "1000000")
     if view:
         results.end()
-        run(show_map, "view", map_file, scans_file, "--open")
+        run(maps.view, "view", map_file, scans_file, "--open")
     else:
         results.add(f"next: {shlex.join(['radarsdf', 'view', map_file, scans_file])}")

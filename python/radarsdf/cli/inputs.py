@@ -17,8 +17,7 @@ from radarsdf.io.read import read
 from radarsdf.io.recordings import Request
 from radarsdf.map.map import Map
 from radarsdf.scans import Notes, Scans
-from radarsdf.tiles.tiled_map import lacking, load
-from radarsdf.view.serving import free_port, require_viser
+from radarsdf.tiles.tiled_map import TiledMap, load
 
 MAP_SUFFIX = ".safetensors"
 
@@ -30,7 +29,8 @@ def is_map(path: Path) -> bool:
 
 def load_map(path: Path) -> Map:
     radar_map = load(path)
-    if tiles := lacking(radar_map):
+    if isinstance(radar_map, TiledMap) and (missing := radar_map.missing):
+        tiles = f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
         warn(f"warning: {path} lacks {tiles}: radarsdf tiles status {path} lists the reasons")
     return radar_map
 
@@ -129,9 +129,3 @@ def inputs_of(given: Namespace) -> list[Path | None]:
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:
     return {name: getattr(given, name) for name in LIMITS}
-
-
-def check_address(given: Namespace) -> None:
-    """Raise an ImportError if viser is missing, an OSError if the address is unusable."""
-    require_viser()
-    free_port(given.host, given.port)

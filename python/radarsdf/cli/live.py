@@ -117,8 +117,7 @@ def live(given: Namespace, results: Results) -> None:
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
     request = request_of_topics(given)
     out, trajectory = given.out, given.trajectory
-    if trajectory is not None:
-        checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
+    checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
     check_outputs([out, trajectory, given.mcap, given.rrd], inputs_of(given))
     with ExitStack() as servers, ExitStack() as files:
         sinks, urls = _opened_sinks(given, servers, files)
@@ -131,8 +130,7 @@ def live(given: Namespace, results: Results) -> None:
             scans, unposed = scans_or_unposed(given, find=given.find)
             timed = len(scans.points) and (scans.times_s is not None or not unposed)
             check(timed, f"{given.scans}: scans without poses need times, one per scan")
-            if trajectory is not None:
-                check_pose_times(trajectory, scans.times_s)
+            check_pose_times(trajectory, scans.times_s)
         else:
             # Of the scans of hours of driving, memory holds only the last ones. /tmp may be memory.
             parent = None if out is None else out.absolute().parent
@@ -156,21 +154,27 @@ def live(given: Namespace, results: Results) -> None:
             shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
             paced = {"rate": given.rate, "on_scan": shown, "stopped": stopped}
             done = replay(growing, scans, with_poses=not unposed, **paced)
-        _conclude(results, done, growing)
-        if out is not None:
-            made = growing.map() if given.quick else growing.finish(progress=results.progress)
-            made.save(out)
-            results.add(f"map {out}", out=out)
-        if trajectory is not None:
-            times_s, poses = (column[-done.integrated :] for column in growing.trajectory())
-            write_poses(trajectory, poses, times_s)
-            results.add(f"trajectory {trajectory}", trajectory=trajectory)
+        _add_replay(results, done)
+        _close_and_save(given, results, growing, done.integrated)
         if shown is not None:
             shown.show(final=True)
         files.close()
         if urls and request is None and not stopped():
             with results.until_stopped():
                 wait()
+
+
+def _close_and_save(given: Namespace, results: Results, live_map: LiveMap, integrated: int) -> None:
+    if not live_map.sealed_scans and len(live_map.close_loops()):
+        results.add("loops of the trajectory closed")
+    if given.out is not None:
+        made = live_map.map() if given.quick else live_map.finish(progress=results.progress)
+        made.save(given.out)
+        results.add(f"map {given.out}", out=given.out)
+    if given.trajectory is not None:
+        times_s, poses = (column[-integrated:] for column in live_map.trajectory())
+        write_poses(given.trajectory, poses, times_s)
+        results.add(f"trajectory {given.trajectory}", trajectory=given.trajectory)
 
 
 def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> tuple[list[Sink], list[str]]:
@@ -235,7 +239,7 @@ class _Shown:
                 self._next_grid_s = time.monotonic() + (time.monotonic() - began_s) / _GRID_SHARE
 
 
-def _conclude(results: Results, done: Replay, live_map: LiveMap) -> None:
+def _add_replay(results: Results, done: Replay) -> None:
     check(done.integrated, "; ".join(["no scan was integrated into the map", *done.notes]))
     scans = done.integrated + done.dropped + done.lost
     line = f"{done.integrated} of {scans} scans in the map, {done.dropped} dropped, {done.lost} lost"
@@ -246,5 +250,3 @@ def _conclude(results: Results, done: Replay, live_map: LiveMap) -> None:
     named = zip(("median", "99th percentile", "worst"), values.values(), strict=True)
     took = ", ".join(f"{1e3 * took_s:.1f} ms ({name})" for name, took_s in named)
     results.add(f"a scan took {took}: {hertz:.0f} scans per second", **values, scans_per_second=hertz)
-    if not live_map.sealed_scans and len(live_map.close_loops()):
-        results.add("loops of the trajectory closed")

@@ -7,18 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import radarsdf
-from radarsdf import evaluation
-from radarsdf.arrays import Floats
+from radarsdf.arrays import Floats, NDArray
 from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
 from radarsdf.cli import Results
-from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, mesh_limits, scans_if, split
+from radarsdf.cli.inputs import inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.scans import add_scans, located, unposed_scans
-from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
+from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics, surface_metrics
 from radarsdf.extras import require
 from radarsdf.grids.grid import DISTANCE_SUFFIXES, save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
@@ -37,7 +35,7 @@ from radarsdf.returns.moving import rays_as_measured
 from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import ChangesView, Viewer
-from radarsdf.view.serving import has_display, url_of, wait
+from radarsdf.view.serving import has_display, page_port, url_of, wait
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
@@ -77,8 +75,8 @@ def evaluate(given: Namespace, results: Results) -> None:
             found = read_mesh(mesh_file)
         else:
             found = radar_map.mesh(given.voxel, **mesh_limits(given), progress=results.progress)
-        metrics = evaluation.surface_metrics(found, ground_truth, box=given.box, samples=given.samples)
-        results.add(evaluation.format_metrics(metrics), surface=metrics)
+        metrics = surface_metrics(found, ground_truth, box=given.box, samples=given.samples)
+        results.add(format_metrics(metrics), surface=metrics)
     if radar_map is not None and scans is not None:
         known, held_out = split(scans, holdout)
         if held_out is not None:
@@ -139,7 +137,7 @@ def _poses(words: list[str]) -> NDArray[np.float64]:
 
 
 def view(given: Namespace, results: Results) -> None:
-    check_address(given)
+    page_port(given.host, given.port)
     radar_map = load_map(given.map)
     scans, explained = _scans(given, radar_map, results)
     options = {"box": given.box, "progress": results.progress, "explained": explained}
@@ -185,13 +183,12 @@ def add_report(results: Results, path: Path, subject: Subject) -> None:
 
 def compare(given: Namespace, results: Results) -> None:
     out, report = given.out, given.report
-    if out is not None:
-        checked_suffix(out, MESH_SUFFIXES, "meshes")
+    checked_suffix(out, MESH_SUFFIXES, "meshes")
     check_outputs([out, report], inputs_of(given))
     if report is not None:
         require_extras()
     if given.view:
-        check_address(given)
+        page_port(given.host, given.port)
     scans = scans_if(not is_map(given.scans), given)
     later = load_map(given.scans) if scans is None else scans
     earlier = load_map(given.map)
@@ -230,9 +227,8 @@ def grid(given: Namespace, results: Results) -> None:
     flat = [path for path in out if path.suffix.lower() == ".yaml"]
     for path in out:
         checked_suffix(path, (".npz", ".bt", ".yaml"), "grids")
-    for arrays_path, suffixes in ((given.distances, DISTANCE_SUFFIXES), (given.costmap, (".npz",))):
-        if arrays_path is not None:
-            checked_suffix(arrays_path, suffixes, "arrays of a grid")
+    checked_suffix(given.distances, DISTANCE_SUFFIXES, "arrays of a grid")
+    checked_suffix(given.costmap, (".npz",), "arrays of a grid")
     if given.picture is not None:
         require("matplotlib", what="pictures need")
     pgm = [path.with_suffix(".pgm") for path in flat]

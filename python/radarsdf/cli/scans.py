@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import radarsdf
-from radarsdf import FitConfig
 from radarsdf.arrays import Floats
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
@@ -88,7 +87,7 @@ def write_posed(out: Path, scans: Scans, results: Results, incomplete: str) -> N
 
 
 def posed_scans(
-    scans: Scans, unposed: bool, config: FitConfig, results: Results, *, refine: bool
+    scans: Scans, unposed: bool, config: radarsdf.FitConfig, results: Results, *, refine: bool
 ) -> tuple[Scans, PosedScans]:
     """Estimate the poses of `unposed` scans, or `refine` those of others. Of several segments, return the scans of the longest one."""
     if unposed:
@@ -116,8 +115,7 @@ def posed_scans(
 
 
 def calibrate(given: Namespace, results: Results) -> None:
-    if given.out is not None:
-        checked_suffix(given.out, (".json",), "mountings to write")
+    checked_suffix(given.out, (".json",), "mountings to write")
     check_outputs([given.out], inputs_of(given))
     found = radarsdf.calibrate(scans_or_unposed(given)[0], config=load_config(given))
     for note in found.notes:

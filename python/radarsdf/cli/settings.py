@@ -40,16 +40,16 @@ def _setting_of(text: str) -> dict[str, Any]:
 def info(given: Namespace, results: Results) -> None:
     import torch
 
-    from radarsdf import _core
+    from radarsdf import core
 
-    openmp = _core.openmp_version()
+    openmp = core.openmp_version()
     rows: dict[str, Any] = {
-        "radarsdf": _core.__version__,
+        "radarsdf": core.__version__,
         "python": f"{platform.python_version()} on {platform.platform()}",
         "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
-        "compiler": _core.compiler(),
-        "openmp": f"{openmp}, {_core.num_threads()} threads" if openmp else "none: the core is serial",
-        "instruction_set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
+        "compiler": core.compiler(),
+        "openmp": f"{openmp}, {core.num_threads()} threads" if openmp else "none: the core is serial",
+        "instruction_set": f"{core.instruction_set()} of {', '.join(core.available_instruction_sets())}",
     }
     if given.map is not None:
         from radarsdf.cli.inputs import load_map

@@ -4,8 +4,6 @@ and confidence against both; of a trajectory against the true one.
 The functions take meshes and arrays, not maps, so they apply equally to the results of other programs.
 """
 
-import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
-
 from .predictions import KNNIntensity, confidence_metrics, holdout, intensity_metrics, uncertainty_metrics
 from .surface import format_metrics, surface_metrics
 from .trajectory import trajectory_metrics

@@ -4,12 +4,11 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import ArrayLike, Floats, Ints
 from radarsdf.checks import check, positions, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 

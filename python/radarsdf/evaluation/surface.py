@@ -1,19 +1,15 @@
 """Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness; metrics as text."""
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from radarsdf._core import cell_keys
-from radarsdf.arrays import Bools, Floats, Ints
+from radarsdf.arrays import ArrayLike, Bools, Floats, Ints, Mesh
 from radarsdf.checks import check, check_box, positions, whole_number
+from radarsdf.core import cell_keys
 from radarsdf.threads import resolve_num_threads
-
-if TYPE_CHECKING:
-    import trimesh
 
 PROTOCOL = "radarsdf-surface-1"  # changes with the meaning of a number
 
@@ -25,7 +21,7 @@ _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in flo
 
 
 def surface_metrics(
-    mesh: "trimesh.Trimesh",
+    mesh: Mesh,
     ground_truth: ArrayLike,
     *,
     box: ArrayLike | None = None,
@@ -170,7 +166,7 @@ def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
 
 
-def _triangles(mesh: "trimesh.Trimesh") -> tuple[Floats, Ints]:
+def _triangles(mesh: Mesh) -> tuple[Floats, Ints]:
     """Vertices (V, 3), world, m, and faces (F, 3) of a mesh of any program."""
     is_mesh = hasattr(mesh, "vertices") and hasattr(mesh, "faces")
     check(is_mesh, f"mesh must have vertices and faces, not be {mesh!r:.50}", TypeError)

@@ -3,10 +3,9 @@
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from radarsdf.arrays import Floats
+from radarsdf.arrays import ArrayLike, Floats
 from radarsdf.checks import check, check_poses, real_array
 from radarsdf.poses.rigid import aligned, between, nearest_rotation, placed, steps, turned_by
 

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
 from radarsdf.arrays import Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
 from radarsdf.field import kernels
 from radarsdf.returns.reflectance import Reflectance
 
@@ -25,21 +25,13 @@ FOURIER_HALF_WIDTH_CELLS = 2048.0
 
 
 class Field(nn.Module, ABC):
-    """Signed distance field on leaf cells. :class:`GridField` and :class:`NeuralField` implement it.
+    """Signed distance field on leaf cells. :class:`GridField` and :class:`NeuralField` implement it."""
 
-    Attributes
-    ----------
-    table : VertexTable
-        The leaf cells, and the rows of the values stored at their corners.
-    reflectance : Reflectance or None
-        Closed-form intensities, or the residuals of a network.
-    """
-
-    table: VertexTable
+    table: VertexTable  # the leaf cells, and the rows of the values stored at their corners
 
     def __init__(self) -> None:
         super().__init__()
-        self.reflectance: Reflectance | None = None
+        self.reflectance: Reflectance | None = None  # closed-form intensities, or the residuals of a network
 
     @abstractmethod
     def sdf(self, points: Tensor) -> Tensor:

@@ -19,8 +19,8 @@ from torch import get_num_threads as threads
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from radarsdf import _core
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, VertexTable
+from radarsdf import core
+from radarsdf.core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, VertexTable
 
 _CACHE_LINE = 64  # bytes
 _Views = list[np.ndarray[Any, Any]]
@@ -108,9 +108,15 @@ class _Interpolate(torch.autograd.Function):
 class _InterpolateBackward(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, out_grad: Tensor, features: Tensor, points: Tensor, located: Tensor, *others: Any
+        ctx: Any,
+        out_grad: Tensor,
+        features: Tensor,
+        points: Tensor,
+        located: Tensor,
+        table: VertexTable,
+        needs_features: bool,
+        needs_points: bool,
     ) -> tuple[Tensor | None, Tensor | None]:
-        table, needs_features, needs_points = others
         ctx.save_for_backward(out_grad, features, points, located)
         ctx.table = table
         ctx.set_materialize_grads(False)  # unused gradients are None, not zeros to interpolate
@@ -144,7 +150,7 @@ class _Fourier(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, half_width_m: float, first: int, count: int) -> Tensor:
         out = points.new_empty((points.shape[0], 6 * count))
-        _core.fourier(view(points), half_width_m, first, count, out.numpy(), threads())
+        core.fourier(view(points), half_width_m, first, count, out.numpy(), threads())
         ctx.save_for_backward(out)
         ctx.frequencies = (half_width_m, first, count)
         return out
@@ -186,7 +192,7 @@ def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequ
 def spherical_harmonics(directions: Tensor) -> Tensor:
     """Return real spherical harmonics (N, 16) of degree 0 to 3 of unit vectors (N, 3). Not differentiable."""
     out = directions.new_empty((directions.shape[0], NUM_SPHERICAL_HARMONICS))
-    _core.spherical_harmonics(view(directions), out.numpy(), threads())
+    core.spherical_harmonics(view(directions), out.numpy(), threads())
     return out
 
 
@@ -210,7 +216,7 @@ class _MLP(torch.autograd.Function):
         out = inputs[0].new_empty((inputs[0].shape[0], layers[-1].shape[0]))
         keep = any(ctx.needs_input_grad)
         ctx.views = views = [rows_view(x) for x in inputs], *layer_views(layers)
-        ctx.hidden = _core.mlp(*views, out.numpy(), keep, threads())
+        ctx.hidden = core.mlp(*views, out.numpy(), keep, threads())
         ctx.save_for_backward(*tensors)
         ctx.num_layers = num_layers
         return out
@@ -236,6 +242,7 @@ class _MLP(torch.autograd.Function):
         views: list[Any] = [None if g is None else g.numpy() for g in grads]
         by_weights, by_biases = (views[:split:2], views[1:split:2]) if by_layers else (None, None)
         given: tuple[_Views, _Views, _Views] = ctx.views
-        into = by_weights, by_biases, views[split:]
-        _core.mlp_backward(*given, ctx.hidden, rows_view(out_grad), *into, threads())
+        core.mlp_backward(
+            *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
+        )
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))

@@ -1,3 +1,1 @@
 """Fitting of a map to scans with poses: the steps of a fit, the averaged and the trained surface, and estimates of its cost."""
-
-import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime

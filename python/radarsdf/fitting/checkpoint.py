@@ -9,7 +9,7 @@ from typing import Any
 from safetensors import SafetensorError
 from torch import Tensor
 
-from radarsdf import _core
+from radarsdf import core
 from radarsdf.checks import AnyPath, check, path_of, restating
 from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
 from radarsdf.io.files import check_regular_file, write_whole
@@ -32,7 +32,7 @@ class Checkpoint:
 
     def __init__(self, path: AnyPath, rays: Rays, scale: IntensityScale | None, config: FitConfig) -> None:
         self._path = path_of(path, "checkpoint")
-        identity: dict[str, Any] = {"version": _core.__version__, "scans": _digest(rays, scale)}
+        identity: dict[str, Any] = {"version": core.__version__, "scans": _digest(rays, scale)}
         identity["config"] = settings_of_results(config)
         self._identity: dict[str, Any] = json.loads(json.dumps(identity))
         self._next_s = time.monotonic() + _EVERY_S

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf._core import FEATURE_DIM, CellSet
-from radarsdf.arrays import Bools
+from radarsdf.arrays import ArrayLike, Bools
 from radarsdf.checks import check, instance
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import FEATURE_DIM, CellSet
 from radarsdf.field.field import intensity_widths, sdf_widths, weights_of
 from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_BAND_CELLS, NEAR_SAMPLES, near_and_labelled
 from radarsdf.fitting.surface_returns import BAND_CELLS, TRUNCATION_CELLS

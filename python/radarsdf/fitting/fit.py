@@ -3,17 +3,15 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 
-from radarsdf._core import cell_keys, stable_order
-from radarsdf.arrays import Bools, Floats32, Ints
+from radarsdf.arrays import ArrayLike, Bools, Floats32, Ints
 from radarsdf.checks import AnyPath, instance, pose_matrices
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import cell_keys, stable_order
 from radarsdf.field.field import Field, NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import Schedule, check_extent, check_fit, skipped_parts
@@ -134,7 +132,7 @@ _Stop = KeyboardInterrupt | Diverged | None
 _ENOUGH_RETURNS, _ENOUGH_PER_PLANE = 200_000, 16
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class FitInput:
     """Input of a fit. Fields that are None are computed from the rays."""
 
@@ -176,7 +174,7 @@ def fit_rays(
     return radar_map
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class _Fit:
     config: FitConfig
     progress: bool | None

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from radarsdf import _core
+from radarsdf import core
 from radarsdf.arrays import Bytes, Floats32, Ints, Ints32
 from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
@@ -118,7 +118,7 @@ class RaySampler:
         if noise_rad > 0:
             # Isotropic noise is simpler. Along the beam it is small compared with the width of the band.
             noise = torch.randn(count, 3, generator=self._generator, dtype=torch.float32, device="cpu")
-            batch.points[:] += noise.numpy() * (noise_rad * batch.of_ray[:, _core.RAY_RANGE, None])
+            batch.points[:] += noise.numpy() * (noise_rad * batch.of_ray[:, core.RAY_RANGE, None])
         return batch
 
     def batch(self, parts: int = 1) -> Batch:
@@ -130,18 +130,18 @@ class RaySampler:
             self._layouts[key] = _Layout.of(counts, parts, self._config)
         layout, places, seed = self._layouts[key], self._take(max(counts)), draw_seed(self._generator)
         of_samples = layout.ray, layout.number, layout.kind, layout.segments
-        return Batch(*_core.draw_samples(self._rays, places, *of_samples, seed), layout.parts)
+        return Batch(*core.draw_samples(self._rays, places, *of_samples, seed), layout.parts)
 
 
 def _in_morton_order(rays: Rays, values: Floats32 | None, leaf_size_m: float, num_threads: int) -> Floats32:
     """Return :attr:`Batch.of_ray` for all rays, in Morton order of their returns."""
     # A ray is one row of 32 bytes, half a cache line: a batch reads it by one gather.
-    order = _core.stable_order(_core.cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
+    order = core.stable_order(core.cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
     if values is not None:
         columns.append(values[:, None])
     rows = np.empty((len(rays), sum(column.shape[1] for column in columns)), np.float32)
-    _core.gather_rows([np.ascontiguousarray(column) for column in columns], order, rows, num_threads)
+    core.gather_rows([np.ascontiguousarray(column) for column in columns], order, rows, num_threads)
     return rows
 
 
@@ -200,6 +200,6 @@ class Dropout:
 
     def factors(self, rows: int, columns: int) -> Tensor:
         """Return factors (rows, columns): 0 for dropped elements, 256 / keep for the others, so that the mean is 1."""
-        bytes_ = _core.random_bytes(self.seed, rows, columns)
+        bytes_ = core.random_bytes(self.seed, rows, columns)
         # not < keep: 256 does not fit into a byte
         return torch.from_numpy(bytes_ <= self.keep - 1).float() * (256 / self.keep)

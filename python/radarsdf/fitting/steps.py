@@ -16,7 +16,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional
 
-from radarsdf import _core
+from radarsdf import core
 from radarsdf.arrays import Array, Ints32
 from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
@@ -103,7 +103,7 @@ class CoreGradients(GradientBackend):
     def __init__(self, field: NeuralField, config: FitConfig, *others: Any) -> None:
         super().__init__(field, config, *others)
         network, networks = field.intensity_network, config.networks
-        self._loss = _core.FieldLoss(
+        self._loss = core.FieldLoss(
             table=field.cells.table,
             features=kernels.view(field.cells.features),
             frequencies=(field.half_width_m, field.num_frequencies),
@@ -181,11 +181,11 @@ class AutogradGradients(GradientBackend):
                 assert field.intensity_network is not None
                 geometry = field.geometry(points, frozen=losses == "intensity")
                 logit, rays = geometry.logit, of_ray[: seen[i]]
-                ranges_m = rays[:, _core.RAY_RANGE] - sdf_m[: seen[i]]
-                directions = rays[:, _core.RAY_DIRECTION : _core.RAY_RANGE]
+                ranges_m = rays[:, core.RAY_RANGE] - sdf_m[: seen[i]]
+                directions = rays[:, core.RAY_DIRECTION : core.RAY_RANGE]
                 kept = geometry.first(seen[i], [of_encoding[i] for of_encoding in factors])
                 predicted = field.intensity_network(kept, directions, ranges_m)
-                labels = rays[:, _core.RAY_INTENSITY].clone()
+                labels = rays[:, core.RAY_INTENSITY].clone()
                 labels[labelled[i] :] = 0  # free space returns nothing (3QFPI)
                 # The mean of no samples would be NaN.
                 found["intensity"] = (
@@ -254,7 +254,7 @@ class Soap:
         self._adam = Adam(compress(self.parameters, self._are_others), learning_rate)
         matrices = list(compress(self.parameters, self._are_matrices))
         self._weights = [kernels.view(p) for p in matrices]
-        self._memories = [p.new_zeros(_core.soap_memory_size(*p.shape)) for p in matrices]
+        self._memories = [p.new_zeros(core.soap_memory_size(*p.shape)) for p in matrices]
 
     def state(self) -> dict[str, Tensor]:
         state = {f"memory.{i}": memory for i, memory in enumerate(self._memories)}
@@ -262,7 +262,7 @@ class Soap:
 
     def step(self, gradients: Sequence[Tensor], number: int, share: float, pool: ThreadPool | None) -> None:
         self._adam.step(list(compress(gradients, self._are_others)), number, share, None)
-        _core.soap_step(
+        core.soap_step(
             weights=self._weights,
             gradients=[g.numpy() for g in compress(gradients, self._are_matrices)],
             memories=[memory.numpy() for memory in self._memories],

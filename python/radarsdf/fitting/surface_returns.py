@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from radarsdf._core import CellSet, VertexTable
 from radarsdf.arrays import Bools, Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import CellSet, VertexTable
 from radarsdf.field.field import GridField
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS
 from radarsdf.returns.evidence import ReturnsOfCells, bridged

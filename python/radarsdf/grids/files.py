@@ -6,11 +6,10 @@ from pathlib import Path
 from uuid import UUID
 
 import numpy as np
-from numpy.typing import NDArray
 
-from radarsdf._core import cell_keys
-from radarsdf.arrays import Bools, Floats, Floats32, Ints
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, NDArray
 from radarsdf.checks import check
+from radarsdf.core import cell_keys
 from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 
 _PIXELS = np.array([254, 0, 205], np.uint8)  # grey values of map_saver for free, occupied and unknown
@@ -96,7 +95,7 @@ def write_vdb(path: Path, values: Floats32, known: Bools, origin: Floats, voxel_
 def _vdb_tree(values: Floats32, known: Bools, background: np.float32) -> tuple[bytes, bytes]:
     """Encode OpenVDB's tree: its nodes of 4096³, 128³ and 8³ voxels, depth first, and the values of the latter."""
 
-    def leaves(array: NDArray, at: tuple[int, ...]) -> NDArray:  # type: ignore[type-arg]
+    def leaves(array: Array, at: tuple[int, ...]) -> Array:
         """Return the voxels (4096, 512) of a node of 128³, by leaf."""
         part = array[tuple(slice(128 * a, 128 * (a + 1)) for a in at)]
         part = np.pad(part, [(0, 128 - size) for size in part.shape])

@@ -3,17 +3,15 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from os import PathLike
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.ndimage import distance_transform_edt
 
-from radarsdf.arrays import Bools, Floats, Floats32, Ints
-from radarsdf.checks import check, number, path_of, real_array
+from radarsdf.arrays import ArrayLike, Bools, Floats, Floats32, Ints, NDArray
+from radarsdf.checks import AnyPath, check, number, path_of, real_array
 from radarsdf.grids.files import write_map_server, write_octomap, write_vdb
 from radarsdf.io.files import checked_suffix
 from radarsdf.io.npz import write_arrays
@@ -71,7 +69,7 @@ class FlatGrid:
     state: NDArray[np.int8]
     """(X, Y) -1: unknown, 0: free, 1: occupied."""
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the grid in the format of ROS's map_server: ``NAME.yaml``, which is `path`, and the image ``NAME.pgm``.
 
         Raises a ValueError for another suffix, an OSError if a file cannot be written.
@@ -308,7 +306,7 @@ class Grid:
         state[free], state[(self.occupied & between).any(axis=2)] = FREE, OCCUPIED
         return FlatGrid(self.origin[:2].copy(), self.voxel_size, state)
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the grid to a file. An existing one is replaced only once the new one is complete.
 
         Parameters

@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion
 from scipy.special import ndtr
 
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Floats32, Ints
 from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from radarsdf.map.map import Map
@@ -166,7 +165,7 @@ def _coarser(fine: Grid, parts: int) -> Grid:
     shape = [n // parts for n in fine.shape]
     split = [n for length in shape for n in (length, parts)]
 
-    def blocks(values: NDArray) -> NDArray:  # type: ignore[type-arg]
+    def blocks(values: Array) -> Array:
         return values.reshape(split).transpose(0, 2, 4, 1, 3, 5).reshape(*shape, parts**3)
 
     state = blocks(fine.state)

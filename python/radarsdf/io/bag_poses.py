@@ -16,7 +16,6 @@ from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.io import bag_messages
 from radarsdf.io import poses as pose_files
-from radarsdf.io.bag_messages import Clock, topics_with
 from radarsdf.io.poses import StampedPoses, Trajectory, TransformChain
 from radarsdf.io.recordings import FindPoses, Request
 
@@ -61,7 +60,7 @@ class Track:
             what = f"{damaged} of {count} are not finite, with a unit quaternion"
             request.notes.add(f"poses of {name} left out: {what}")
         times_s = self.table[:, :2].T
-        clock = Clock.of(times_s, name, request.stamps, request.notes)
+        clock = bag_messages.Clock.of(times_s, name, request.stamps, request.notes)
         return pose_files.trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)
 
     def link(self, request: Request) -> Trajectory | Floats:
@@ -193,15 +192,15 @@ class Tracks:
 
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
-    topics = topics_with(bag_messages.TRANSFORM_TYPES, bag_messages.topics_of(paths))
+    topics = bag_messages.topics_with(bag_messages.TRANSFORM_TYPES, bag_messages.topics_of(paths))
     return _tracks_in(paths, set(topics), request).tree(request)
 
 
 def poses_in_bags(paths: list[Path], request: Request, frames: list[str], preferred: str | None) -> FindPoses:
     """Return a function from frame to poses, if possible of the topic `preferred`. `frames`: of scans, the most frequent first."""
     notes, wanted, topics = request.notes, request.pose_topic, bag_messages.topics_of(paths)
-    transforms = set(topics_with(bag_messages.TRANSFORM_TYPES, topics))
-    fitting = set(topics_with(bag_messages.POSE_TYPES, topics))
+    transforms = set(bag_messages.topics_with(bag_messages.TRANSFORM_TYPES, topics))
+    fitting = set(bag_messages.topics_with(bag_messages.POSE_TYPES, topics))
     wants_tf = wanted in transforms or (wanted is not None and wanted.strip("/") == "tf" and bool(transforms))
     listed = ", ".join(sorted(fitting | transforms)) or "none"
     known = wanted is None or wants_tf or wanted in fitting

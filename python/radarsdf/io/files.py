@@ -32,10 +32,10 @@ def check_regular_file(path: AnyPath) -> None:
         pass
 
 
-def checked_suffix(path: AnyPath, suffixes: Sequence[str], what: str) -> str:
-    """Return the suffix of a path in lower case. Raises a ValueError unless it is one of these, those of files of `what`."""
-    suffix = path_of(path, "path").suffix.lower()
-    check(suffix in suffixes, f"{path}: files of {what} end in {', '.join(suffixes)}")
+def checked_suffix(path: AnyPath | None, suffixes: Sequence[str], what: str) -> str:
+    """Return the suffix of a path, if any, in lower case. Raises a ValueError unless it is one of these, those of files of `what`."""
+    suffix = "" if path is None else path_of(path, "path").suffix.lower()
+    check(path is None or suffix in suffixes, f"{path}: files of {what} end in {', '.join(suffixes)}")
     return suffix
 
 

@@ -5,19 +5,16 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
-from radarsdf.arrays import Array, Bytes, Floats
+from radarsdf.arrays import Array, Bytes, Floats, Mesh
 from radarsdf.checks import AnyPath, check, path_of, positions, restating
 from radarsdf.io.clouds import ply_bytes, ply_header, read_points, records
 from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, write_whole
 from radarsdf.io.npz import TRUTH_ARRAYS, arrays_of
 from radarsdf.scans import Columns
-
-if TYPE_CHECKING:
-    import trimesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
@@ -49,7 +46,7 @@ def holds_mesh(path: AnyPath) -> bool:
     return re.search(rb"element\s+face\s+0*[1-9]", header) is not None
 
 
-def write_mesh(path: AnyPath, mesh: "trimesh.Trimesh") -> None:
+def write_mesh(path: AnyPath, mesh: Mesh) -> None:
     """Write a mesh atomically.
 
     PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. In GLB, a rotation of the root turns the y axis
@@ -73,12 +70,12 @@ def write_mesh(path: AnyPath, mesh: "trimesh.Trimesh") -> None:
     suffix = checked_suffix(path, MESH_SUFFIXES, "meshes")
     if suffix in _FLOAT32_SUFFIXES:
         check_fits_float32(path, np.asarray(mesh.vertices, np.float64))
-    own: dict[str, Callable[[trimesh.Trimesh], bytes]] = {".ply": _ply, ".glb": _glb}
+    own: dict[str, Callable[[Mesh], bytes]] = {".ply": _ply, ".glb": _glb}
     exported: Any = own[suffix](mesh) if suffix in own else mesh.export(file_type=suffix[1:])
     write_whole(path, exported.encode() if isinstance(exported, str) else exported)
 
 
-def read_mesh(path: AnyPath) -> "trimesh.Trimesh":
+def read_mesh(path: AnyPath) -> Mesh:
     """Read a triangle mesh.
 
     Parameters
@@ -113,7 +110,7 @@ def read_mesh(path: AnyPath) -> "trimesh.Trimesh":
     check(whole, f"{path}: a triangle refers to a vertex that does not exist")
     if suffix == ".glb":
         mesh.apply_transform(T_GLTF_WORLD.T)
-    return cast("trimesh.Trimesh", mesh)
+    return cast(Mesh, mesh)
 
 
 def read_ground_truth(path: AnyPath) -> Floats:
@@ -134,7 +131,7 @@ def read_ground_truth(path: AnyPath) -> Floats:
     return read_points(file)
 
 
-def _scalars_and_colors(mesh: "trimesh.Trimesh") -> tuple[Columns, Bytes | None]:
+def _scalars_and_colors(mesh: Mesh) -> tuple[Columns, Bytes | None]:
     """Scalar attributes (V,) float32 by name, and sRGB colours (V, 4), if there are any, of the vertices."""
     attributes, visual = mesh.vertex_attributes.items(), cast(Any, mesh.visual)
     scalars = {n: np.asarray(v, np.float32) for n, v in attributes if np.shape(v) == (len(mesh.vertices),)}
@@ -142,7 +139,7 @@ def _scalars_and_colors(mesh: "trimesh.Trimesh") -> tuple[Columns, Bytes | None]
     return scalars, np.asarray(visual.vertex_colors, np.uint8) if has_colors else None
 
 
-def _glb(mesh: "trimesh.Trimesh") -> bytes:
+def _glb(mesh: Mesh) -> bytes:
     """Encode as GLB, without what its JSON cannot hold: attributes and metadata that are not finite."""
     scalars, colors = _scalars_and_colors(mesh)
     attributes = {f"_{name}": values for name, values in scalars.items() if np.isfinite(values).all()}
@@ -153,7 +150,7 @@ def _glb(mesh: "trimesh.Trimesh") -> bytes:
     return encode_glb(mesh.vertices, mesh.faces, attributes, matrix=T_GLTF_WORLD, extras=numbers)
 
 
-def _ply(mesh: "trimesh.Trimesh") -> bytes:
+def _ply(mesh: Mesh) -> bytes:
     scalars, colors = _scalars_and_colors(mesh)
     columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True)) | scalars
     if colors is not None:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Array, Bytes
+from radarsdf.arrays import Array, ArrayLike, Bytes
 from radarsdf.checks import AnyPath, check, instance, path_of
 from radarsdf.io.files import check_regular_file, reading, whole_file
 from radarsdf.rig import Imu

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from radarsdf import checks
-from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats
 from radarsdf.checks import AnyPath, check, check_pose, check_poses, path_of, real_array
 from radarsdf.io.columns import in_seconds, read_numbers, read_table, read_text, scaled, without_unit
 from radarsdf.io.files import check_regular_file, checked_suffix, reading, write_whole
@@ -291,9 +290,9 @@ def read_calibration(path: Path) -> Floats | None:
         return check_pose(np.array([*numbers, 0, 0, 0, 1], np.float64).reshape(4, 4), "Tr")
 
 
-def check_pose_times(path: AnyPath, times_s: ArrayLike | None) -> None:
-    """Raise a ValueError if the format of the file needs times and there are none."""
-    possible = times_s is not None or path_of(path, "path").suffix.lower() != ".tum"
+def check_pose_times(path: AnyPath | None, times_s: ArrayLike | None) -> None:
+    """Raise a ValueError if the format of the file, if any, needs times and there are none."""
+    possible = times_s is not None or path is None or path_of(path, "path").suffix.lower() != ".tum"
     check(possible, f"{path} needs times, s, and there are none: .kitti and .npy do without")
 
 

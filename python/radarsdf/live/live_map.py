@@ -1,21 +1,18 @@
 """Incremental map of a driving robot."""
 
-import dataclasses
 import os
 import threading
 import weakref
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
-from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from radarsdf import checks
-from radarsdf.arrays import Floats, Keys
-from radarsdf.checks import check, check_pose, instance
+from radarsdf.arrays import ArrayLike, Floats, Keys, Mesh
+from radarsdf.checks import AnyPath, check, check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit, fit_rays
 from radarsdf.live.state import GrowingState
@@ -33,9 +30,6 @@ from radarsdf.returns.moving import moving_returns
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Label, Mounted, checked_mountings
 from radarsdf.scans import Scans
-
-if TYPE_CHECKING:
-    import trimesh
 
 _MOST_UNPLACED = 10 * SUBMAP_SCANS  # lost scans to search the map for
 _RANGED = 100  # scans from which the median range is known
@@ -121,7 +115,7 @@ class LiveMap:
         *,
         origin: ArrayLike | None = None,
         max_bytes: int | None = None,
-        folder: str | PathLike[str] | None = None,
+        folder: AnyPath | None = None,
         T_body_sensor: Mapping[Any, ArrayLike] | None = None,
     ) -> None:
         config = FitConfig() if config is None else instance(config, FitConfig, "config")
@@ -260,7 +254,7 @@ class LiveMap:
         known = sensor is None if mountings is None else sensor in mountings
         check(known, f"sensor must be one of T_body_sensor, {list(mountings or ())}, not {sensor!r:.50}")
         if mountings is not None:
-            scan = dataclasses.replace(scan, radar=Mounted(sensor, mountings[sensor]))
+            scan = replace(scan, radar=Mounted(sensor, mountings[sensor]))
         given = None if pose is None else check_pose(pose, "pose").copy()
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         if self._state.log.folder is not None:
@@ -297,9 +291,7 @@ class LiveMap:
         rows = np.flatnonzero((found.segments == found.segments[-1]) & (found.segments >= 0))
         if len(rows) == 0:
             raise lost
-        return [
-            (dataclasses.replace(scans[i], tracked=True), found.poses[i], self._unplaced[i][0]) for i in rows
-        ]
+        return [(replace(scans[i], tracked=True), found.poses[i], self._unplaced[i][0]) for i in rows]
 
     def _integrate(
         self, scan: LoggedScan, given: Floats | None, scan_id: ScanId | None, far: int
@@ -312,9 +304,9 @@ class LiveMap:
             alike = state.with_intensities in (None, with_intensities)
             check(alike, "either all scans have intensities, or none has")
             steps = [] if given is not None else self._follower.seek(state.track, state.log, scan_id, scan)
-            come = {step.scan_id: dataclasses.replace(step.logged, pose=step.found.pose) for step in steps}
+            come = {step.scan_id: replace(step.logged, pose=step.found.pose) for step in steps}
             if given is not None:
-                come[scan_id] = dataclasses.replace(scan, pose=given)
+                come[scan_id] = replace(scan, pose=given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
             lattice, origin = self.config.lattice, state.origin
             if origin is None:
@@ -360,7 +352,7 @@ class LiveMap:
                 pose = check_pose(given, f"the pose of scan {scan_id!r:.50}")
                 scan = self._state.log.get(scan_id)
                 if (pose != scan.pose).any():
-                    moved[scan_id] = dataclasses.replace(scan, pose=pose.copy(), tracked=False)
+                    moved[scan_id] = replace(scan, pose=pose.copy(), tracked=False)
             return self._state.exchange(moved, moved)
 
     def close_loops(self) -> Keys:
@@ -398,7 +390,7 @@ class LiveMap:
             known = dict(zip(ids, refined.poses, strict=True))
             drifted = [placed for placed in now.trajectory() if placed.tracked]
             moved = {placed.scan_id: known.get(placed.scan_id, T @ placed.pose) for placed in drifted}
-            come = {k: dataclasses.replace(now.get(k), pose=pose) for k, pose in moved.items()}
+            come = {k: replace(now.get(k), pose=pose) for k, pose in moved.items()}
             return self._state.exchange(come, come)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
@@ -420,7 +412,7 @@ class LiveMap:
         with self._owned():
             return self._state.clear_outside(middle, radius)
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the state to an ``.npz`` file for :meth:`load`. An existing file is replaced atomically.
 
         Raises
@@ -432,7 +424,7 @@ class LiveMap:
             self._state.save(path)
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> "LiveMap":
+    def load(cls, path: AnyPath, *, folder: AnyPath | None = None) -> "LiveMap":
         """Read a map written by :meth:`save`, with its settings, bit-identically. Tracking resumes from the last scans with times.
 
         `folder`: see the constructor.
@@ -457,7 +449,7 @@ class LiveMap:
             live._state.track = live._state.track.placed(scan_id, scan)
         return live
 
-    def mesh(self, **limits: Any) -> "trimesh.Trimesh":
+    def mesh(self, **limits: Any) -> Mesh:
         """Extract the surface as triangles, world frame, m, in voxels of the size of leaf cells; none if there is no surface.
 
         Only changed distances are recomputed. `limits` are `min_confidence`, `max_uncertainty` and `min_component_triangles` of
@@ -515,7 +507,13 @@ class LiveMap:
             **known,
         )
 
-    def _check(self, points: Any, intensities: Any, doppler_mps: Any, time_s: Any) -> tuple[LoggedScan, int]:
+    def _check(
+        self,
+        points: ArrayLike,
+        intensities: ArrayLike | None,
+        doppler_mps: ArrayLike | None,
+        time_s: float | None,
+    ) -> tuple[LoggedScan, int]:
         """Check a scan, without a pose yet, and count returns too far away. Raise a ValueError if it is invalid."""
         scans, values, left_out = check_scans([points], None if intensities is None else [intensities])
         scan = scans[0].copy()

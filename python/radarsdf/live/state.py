@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from radarsdf._core import QUANTA, SumsChange
 from radarsdf.arrays import Array, Floats, Keys
 from radarsdf.checks import AnyPath, check
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import QUANTA, SumsChange
 from radarsdf.fitting.fit import FitInput
 from radarsdf.interrupts import at_once
 from radarsdf.live import store

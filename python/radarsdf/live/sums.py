@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from radarsdf._core import GrowingSums, SumsChange
 from radarsdf.arrays import Array, Keys
+from radarsdf.core import GrowingSums, SumsChange
 from radarsdf.returns.evidence import VisibilityCounts
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.sums import WEIGHT_UNIT, ScanSums

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, Encoding, VertexTable, cell_keys, marching_cubes_sparse
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import CellBlocks, Encoding, VertexTable, cell_keys, marching_cubes_sparse
 from radarsdf.fitting.surface_returns import (
     BAND_CELLS,
     CELLS_SMOOTHED,
@@ -14,11 +14,10 @@ from radarsdf.fitting.surface_returns import (
     average_at_corners,
     normals_at,
 )
-from radarsdf.map import queries
 from radarsdf.map.confidence import interpolated
 from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.mesh import Surface
-from radarsdf.map.queries import WholeMap
+from radarsdf.map.queries import WholeMap, to_local
 from radarsdf.returns import evidence
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
@@ -181,7 +180,7 @@ class GrowingSurface:
         vertices, faces = marching_cubes_sparse(corners, values, cell_corners, *placement)
         of_cells = evidence.Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
-        points = queries.to_local(scene, vertices + self._origin)
+        points = to_local(scene, vertices + self._origin)
         columns = of_cells.columns(rows["keys"], resolve_num_threads(0))
         at = interpolated(CellBlocks(rows["keys"]), columns, leaf_m, points)
         return scene, Surface.from_triangles(scene, vertices, faces, at, len(rows["keys"]))

@@ -1,9 +1,10 @@
-"""Colour map of intensities."""
+"""Colour map of intensities, and scales of it."""
+
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Bytes
+from radarsdf.arrays import Array, ArrayLike, Bytes
 from radarsdf.checks import check, real_array
 
 # From indigo through magenta and orange to yellow. Lightness increases from 0.32 to 0.93 in OKLab, in equal steps.
@@ -29,3 +30,25 @@ def intensity_colors(values: ArrayLike, low: float, high: float) -> Bytes:
     for channel in range(3):
         colors[known, channel] = np.rint(np.interp(where[known], positions, _ANCHORS[:, channel]))
     return colors
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A fixed scale of sRGB colours from `low` to `high`; NaN is grey."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Array) -> "Scale":
+        """Build from the 2nd and the 98th percentile of values (N,)."""
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
+        return cls(float(low), float(high))
+
+    def __call__(self, values: Array) -> Bytes:
+        """(N, 3) sRGB of values (N,)."""
+        return intensity_colors(values, self.low, self.high)[:, :3]
+
+
+SHARES = Scale(0.0, 1.0)

@@ -10,10 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from radarsdf._core import CellBlocks
 from radarsdf.arrays import Bools, Bytes, Floats, Floats32, Ints
-from radarsdf.map import queries
-from radarsdf.map.queries import MapContents, WholeMap
+from radarsdf.core import CellBlocks
+from radarsdf.map.queries import MapContents, WholeMap, plane, signed_distance
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 from radarsdf.returns.view_statistics import MOST_SCANS
@@ -190,9 +189,9 @@ def free_space_odds(contents: MapContents) -> Floats:
     keys = keys[:: max(1, len(keys) // _ODDS_CELLS)]
     leaf_m = contents.config.leaf_size_m
     centres = ((lattice_of(keys) + 0.5) * leaf_m).astype(np.float32)
-    distances_m = queries.signed_distance(contents, centres)
+    distances_m = signed_distance(contents, centres)
     # At grazing incidence the field exceeds the distance, and with noisy returns falls below it; so does its gradient.
-    edge = leaf_m * np.linalg.norm(queries.plane(contents, centres)[:, 1:], axis=1)
+    edge = leaf_m * np.linalg.norm(plane(contents, centres)[:, 1:], axis=1)
     weights = confidence(contents, evidence(contents, centres)).astype(np.float64)
     passed = contents.free_space().at(keys)
 

@@ -3,21 +3,19 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 
 from radarsdf import checks
-from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Mesh
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, positive, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, confidence, free_space_odds, uncertainty
-from radarsdf.map.queries import MapContents
 from radarsdf.map.threshold import VOXEL_M
 from radarsdf.map.view import DepthImage, View, ViewedMap, view_from
 from radarsdf.memory import check_views
@@ -26,9 +24,6 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.rig import Label
-
-if TYPE_CHECKING:
-    import trimesh
 
 Query = Callable[..., Array]
 
@@ -176,7 +171,7 @@ class Map(ABC):
         max_uncertainty: float | None = None,
         min_component_triangles: int | None = None,
         progress: bool | None = None,
-    ) -> "trimesh.Trimesh":
+    ) -> Mesh:
         """Extract the surface as triangles, by marching cubes in the leaf cells of the map.
 
         Parameters
@@ -423,7 +418,7 @@ class Map(ABC):
 
     @property
     @abstractmethod
-    def contents_of_any(self) -> MapContents:
+    def contents_of_any(self) -> queries.MapContents:
         """The contents of the map, or of any of its tiles, for properties that all share."""
 
     @cached_property

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from radarsdf import _core
-from radarsdf.arrays import Array, Bools, Ints32
+from radarsdf import core
+from radarsdf.arrays import Array, ArrayLike, Bools, Ints32
 from radarsdf.checks import check, real_array, refuse_masked
 
 
@@ -96,22 +95,22 @@ def marching_cubes(
     check(iso.shape == () and np.isfinite(iso), f"level must be a finite number, not {level!r:.50}")
     rest = usable, *_as_placement(spacing, origin, shape), float(iso), num_threads
     if not isinstance(samples, Tensor):
-        return _core.marching_cubes_dense(samples, *rest)
+        return core.marching_cubes_dense(samples, *rest)
     if samples.requires_grad and torch.is_grad_enabled():
         return _MarchingCubes.apply(samples, *rest)  # type: ignore[no-untyped-call]
-    vertices, faces = _core.marching_cubes_dense(samples.detach().numpy(), *rest)
+    vertices, faces = core.marching_cubes_dense(samples.detach().numpy(), *rest)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
 def sparse_lattice(cells: Array, *, num_threads: int = 0) -> tuple[Ints32, Ints32, Ints32]:
     """Return the sorted unique cells (M', 3) of lower corners (M, 3), their sorted corners (K, 3), and rows of these (M', 8)."""
-    return _core.sparse_lattice(np.ascontiguousarray(cells, np.int32), num_threads)
+    return core.sparse_lattice(np.ascontiguousarray(cells, np.int32), num_threads)
 
 
 class _MarchingCubes(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, samples: Tensor, *placement: Any) -> tuple[Tensor, Tensor]:
-        found = _core.marching_cubes_dense_with_edges(samples.detach().numpy(), *placement)
+        found = core.marching_cubes_dense_with_edges(samples.detach().numpy(), *placement)
         vertices, faces, edges = map(torch.from_numpy, found)
         _mask, spacing, _origin, level, num_threads = placement
         ctx.save_for_backward(samples, edges)
@@ -130,7 +129,7 @@ class _MarchingCubes(torch.autograd.Function):
         # The core fills it. NumPy requests huge pages, PyTorch does not.
         grad = np.empty(samples.shape, samples.dtype)
         upstream = vertices_grad.contiguous().numpy()
-        _core.marching_cubes_dense_backward(samples, edges, upstream, spacing, level, grad, num_threads)
+        core.marching_cubes_dense_backward(samples, edges, upstream, spacing, level, grad, num_threads)
         return torch.from_numpy(grad), *(None,) * 5
 
 

@@ -4,25 +4,20 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from radarsdf._core import marching_cubes_sparse, mesh_components, vertex_areas
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Mesh, NDArray
 from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.map import queries
+from radarsdf.core import marching_cubes_sparse, mesh_components, vertex_areas
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
 from radarsdf.map.marching_cubes import sparse_lattice
-from radarsdf.map.queries import MapContents, WholeMap
+from radarsdf.map.queries import MapContents, WholeMap, evaluate, signed_distance, to_local
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_memory
-
-if TYPE_CHECKING:
-    import trimesh
 
 _MAX_VOXELS = 2**30  # duplicates included. Lattice coordinates and rows of corners are int32
 _MEMORY_PER_VOXEL = 220.0  # bytes, measured
@@ -51,7 +46,7 @@ class Surface:
         """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
         vertices, faces, searched = extract_triangles(contents, voxel_m, box, progress)
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
-        points = queries.to_local(contents, vertices + contents.origin)
+        points = to_local(contents, vertices + contents.origin)
         return cls.from_triangles(contents, vertices, faces, evidence(contents, points), searched)
 
     @classmethod
@@ -78,13 +73,13 @@ class Surface:
             kept[rows] = large.take(labels)
         return kept
 
-    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> "trimesh.Trimesh":
+    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> Mesh:
         """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         threshold = self.tally.threshold(limits.min_confidence)
         return self.part(origin, self.kept(limits), **counts, **vars(threshold))
 
-    def part(self, origin: Floats, kept: Bools, **metadata: float) -> "trimesh.Trimesh":
+    def part(self, origin: Floats, kept: Bools, **metadata: float) -> Mesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
         import trimesh  # noqa: PLC0415 - slow
 
@@ -166,7 +161,7 @@ def sample_lattice(
     if voxel_size < leaf_size_m and not even:
         # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
         middles = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-        voxels = voxels[queries.evaluate(contents.field.occupied, middles)]
+        voxels = voxels[evaluate(contents.field.occupied, middles)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return corners, voxel_corners, distances_m, len(cells)
@@ -220,7 +215,7 @@ def _corner_distances(
     # A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
     # until it is in an occupied cell, and the distance moved is added to its absolute value.
     points = corners.astype(np.float32) * np.float32(voxel_size)
-    moved = np.flatnonzero(~queries.evaluate(contents.field.occupied, points))
+    moved = np.flatnonzero(~evaluate(contents.field.occupied, points))
     # Move each corner into its last voxel: NumPy keeps the last assignment of repeated indices.
     owners = np.zeros(len(corners), np.int32)
     owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
@@ -228,8 +223,8 @@ def _corner_distances(
     corner, place, left = points[moved], points[moved], np.arange(len(moved))
     for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
         place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
-        left = left[~queries.evaluate(contents.field.occupied, place[left])]
+        left = left[~evaluate(contents.field.occupied, place[left])]
     points[moved] = place
-    values = queries.signed_distance(contents, points, description="mesh", progress=progress)
+    values = signed_distance(contents, points, description="mesh", progress=progress)
     values[moved] += np.copysign(np.linalg.norm(place - corner, axis=1), values[moved])
     return values

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
@@ -11,10 +10,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from radarsdf._core import CellBlocks
 from radarsdf.arrays import Array, Bools, Floats, Floats32
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import CellBlocks
 from radarsdf.field.field import Field
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.intensities import IntensityScale
@@ -40,7 +39,7 @@ class Deferred(Generic[_Part]):
         return self._part
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class WholeMap:
     """Properties of the whole map on which evidence at a place depends, besides the returns there."""
 
@@ -50,7 +49,7 @@ class WholeMap:
     returns_per_cell: float  # mean number of returns in the cells of surfels with returns
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class MapContents(WholeMap):
     field: Field  # signed distance and intensity, in the local frame
     intensity_scale: IntensityScale | None  # range of the training intensities. None without intensities

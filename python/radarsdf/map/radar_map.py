@@ -21,11 +21,10 @@ from radarsdf.field.field import Field, GridField, NeuralField
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import check_arrays
 from radarsdf.io.tensors import open_tensors, tensor_bytes
-from radarsdf.map import queries
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, dense_cells, evidence
 from radarsdf.map.map import Map, Query
 from radarsdf.map.mesh import Surface
-from radarsdf.map.queries import MapContents
+from radarsdf.map.queries import MapContents, into_cells, to_local, where
 from radarsdf.map.threshold import Limits
 from radarsdf.map.view import ViewedMap
 from radarsdf.returns.evidence import Evidence
@@ -70,15 +69,15 @@ class RadarMap(Map):
         return _from_pickle, (save(tensors), description)  # bytes: the pickle needs no classes of PyTorch
 
     def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
-        points, *rest = (queries.to_local(self._contents, x) for x in (world, *others))
-        inside = queries.into_cells(self._contents, points)
+        points, *rest = (to_local(self._contents, x) for x in (world, *others))
+        inside = into_cells(self._contents, points)
         known: Any = np.isfinite(points).all(axis=1) if extrapolate else inside
         for x in rest:
             known = known & np.isfinite(x).all(axis=1)
-        return queries.where(known, query, self._contents, points, *rest)
+        return where(known, query, self._contents, points, *rest)
 
     def _observed(self, world: Floats) -> Bools:
-        return queries.into_cells(self._contents, queries.to_local(self._contents, world))
+        return into_cells(self._contents, to_local(self._contents, world))
 
     @property
     def contents_of_any(self) -> MapContents:
@@ -101,7 +100,7 @@ class RadarMap(Map):
         return CellsInBox(self.origin + first * leaf_m, *cells)
 
     def evidence_at(self, world: Floats) -> EvidenceAt:
-        return evidence(self._contents, queries.to_local(self._contents, world))
+        return evidence(self._contents, to_local(self._contents, world))
 
     def view_statistics(self) -> ViewStatisticsAt:
         return self._contents.views_in_world()

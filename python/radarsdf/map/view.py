@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from radarsdf._core import SurfaceTracer, cell_keys
 from radarsdf.arrays import Floats, Floats32, Ints
 from radarsdf.checks import check, flag, number, whole_number
+from radarsdf.core import SurfaceTracer, cell_keys
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, roughness
 from radarsdf.map.mesh import Surface
-from radarsdf.map.queries import MapContents, WholeMap
 from radarsdf.map.threshold import Limits, across_triangles
 from radarsdf.memory import check_views
 from radarsdf.products import turned
@@ -109,7 +108,7 @@ class ViewedMap:
     max_memory_bytes: int | None  # memory limit of views. None: what the system has left
 
     @classmethod
-    def of(cls, contents: MapContents) -> "ViewedMap":
+    def of(cls, contents: queries.MapContents) -> "ViewedMap":
         """Build for a whole map, in voxels of a leaf cell's size, which is finer than the noise of a radar."""
         config = contents.config
         check_views(config.max_memory_bytes, cells=len(contents.evidence.visibility))
@@ -129,7 +128,7 @@ class ViewedMap:
     def of_surface(
         cls,
         surface: Surface,
-        scene: WholeMap,
+        scene: queries.WholeMap,
         origin: Floats,
         evidence_at: Callable[[Floats], EvidenceAt],
         intensity: _Intensity | None,

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 from typing_extensions import Self
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import ArrayLike, Floats, Ints
 from radarsdf.checks import MAX_TIME_S, check, instance, real_array, values_of_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import CLEAR, sign_significance, turns_fast

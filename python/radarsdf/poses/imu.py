@@ -16,11 +16,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import Floats, Ints, NDArray
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.motion import MotionRate, interpolate, usual_duration_s
 from radarsdf.poses.rigid import covariance_in, nearest_rotation, rotation, rotation_vector

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.linalg import eigh, lapack
 from scipy.spatial import cKDTree
 
-from radarsdf._core import CellBlocks, CommonPlanes, LocalPlanes
 from radarsdf.arrays import Bools, Floats, Floats32, Ints32
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.core import CellBlocks, CommonPlanes, LocalPlanes
 from radarsdf.poses.rigid import increments, moved
 from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels

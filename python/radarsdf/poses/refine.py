@@ -4,13 +4,13 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Bools, Floats
+from radarsdf.arrays import ArrayLike, Bools, Floats
 from radarsdf.checks import check, hides_bar, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Verdict
@@ -130,16 +130,10 @@ class JointEstimator:
         return found
 
 
-@dataclass(frozen=True)
-class _FixedPoses:
-    """Anchor at the `fixed` (F,) ones of poses (F, 4, 4)."""
-
-    poses: Floats
-    fixed: Bools
-
-    def __call__(self, poses: Floats) -> tuple[Floats, Floats]:
-        information = _FIXED * self.fixed[:, None]
-        return information[:, :, None] * np.eye(6), information * increments(self.poses, poses)
+def _anchor_at(given: Floats, fixed: Bools, poses: Floats) -> tuple[Floats, Floats]:
+    """Anchor at the `fixed` (F,) ones of `given` poses (F, 4, 4)."""
+    information = _FIXED * fixed[:, None]
+    return information[:, :, None] * np.eye(6), information * increments(given, poses)
 
 
 def _held_out(returns: SensorReturns, seed: int) -> tuple[SensorReturns, SensorReturns]:
@@ -260,7 +254,7 @@ def refine_poses(
     kept = np.zeros(len(given), bool) if fixed is None else np.asarray(fixed)
     masks = kept.shape == (len(given),) and kept.dtype == bool and (fixed is None or not kept.all())
     check(masks, f"fixed must be one bool for each of {len(given)} poses, not all of them True")
-    anchor = _FixedPoses(given, kept) if kept.any() else None
+    anchor = partial(_anchor_at, given, kept) if kept.any() else None
     joined = join_radars(rig, [_compare_doppler(checked, given, rig) for checked in radars])
     scans, times, velocities, notes = joined.scans, joined.times_s, joined.velocities, joined.notes
     if not rigid.all():

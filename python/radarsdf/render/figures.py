@@ -2,44 +2,21 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from radarsdf.arrays import Array, Bytes, Floats
+from radarsdf.arrays import Array, Floats
 from radarsdf.checks import AnyPath
 from radarsdf.extras import require
 from radarsdf.grids.grid import Grid
 from radarsdf.io.files import write_whole
-from radarsdf.map.colors import intensity_colors
+from radarsdf.map.colors import Scale
 from radarsdf.map.view import View
 
 _UNKNOWN = "#d0d0d0"
 _TRAJECTORY_COLORS = ("#d95f02", "#1b6ca8", "#2a7f3f", "#8e44ad")
 _MAX_RETURNS = 60_000  # largest number in a picture of trajectories
-
-
-@dataclass(frozen=True)
-class Scale:
-    """A fixed scale of sRGB colours from `low` to `high`; NaN is grey."""
-
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: Array) -> "Scale":
-        """Build from the 2nd and the 98th percentile of values (N,)."""
-        known = values[np.isfinite(values)]
-        low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
-        return cls(float(low), float(high))
-
-    def __call__(self, values: Array) -> Bytes:
-        """(N, 3) sRGB of values (N,)."""
-        return intensity_colors(values, self.low, self.high)[:, :3]
-
-
-SHARES = Scale(0.0, 1.0)
 
 
 def new_figure(**options: Any) -> Any:

@@ -1,21 +1,14 @@
 """Ray-cast pictures of a mesh, which need no display and no OpenGL."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf._core import SurfaceTracer
-from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
+from radarsdf.arrays import ArrayLike, Bytes, Floats, Floats32, Ints32, Mesh
 from radarsdf.checks import AnyPath, check, real_array
+from radarsdf.core import SurfaceTracer
 from radarsdf.io.files import write_whole
-from radarsdf.map.colors import NEUTRAL, intensity_colors
-from radarsdf.render.figures import Scale, new_figure, png_of
+from radarsdf.map.colors import NEUTRAL, Scale, intensity_colors
+from radarsdf.render.figures import new_figure, png_of
 from radarsdf.threads import resolve_num_threads
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 _PIXELS_AT_ONCE = 1 << 20  # limit of memory
 _CREASE = np.cos(np.deg2rad(40.0))  # edges with a larger angle are drawn sharp, others are shaded smoothly
@@ -23,7 +16,7 @@ _SUPERSAMPLING = 2  # subpixels per pixel and axis, which are averaged for smoot
 
 
 def render(
-    mesh: "trimesh.Trimesh",
+    mesh: Mesh,
     colors: ArrayLike | None = None,
     *,
     width: int = 1600,
@@ -103,7 +96,7 @@ def render(
 
 def save_picture(
     path: AnyPath,
-    mesh: "trimesh.Trimesh",
+    mesh: Mesh,
     *,
     scalar: ArrayLike | None = None,
     label: str = "intensity",

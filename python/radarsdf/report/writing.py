@@ -11,10 +11,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from radarsdf.arrays import Array, Bytes, Floats
+from radarsdf.arrays import Array, ArrayLike, Bytes, Floats
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
 from radarsdf.checking.recording import Finding
 from radarsdf.checks import AnyPath
@@ -22,10 +21,10 @@ from radarsdf.config.fit_config import FitConfig, flat_settings, to_toml
 from radarsdf.evaluation import intensity_metrics, surface_metrics, uncertainty_metrics
 from radarsdf.extras import require
 from radarsdf.io.files import write_whole
-from radarsdf.map.colors import NEUTRAL
+from radarsdf.map.colors import NEUTRAL, SHARES, Scale
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
-from radarsdf.render.figures import SHARES, Scale, draw_trajectories, new_figure, png_of
+from radarsdf.render.figures import draw_trajectories, new_figure, png_of
 from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.scans import Scans

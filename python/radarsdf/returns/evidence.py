@@ -1,14 +1,13 @@
 """Evidence of a surface in each leaf cell, and the leaf cells that bridge gaps."""
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_scans, count_visibility
 from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.core import CellBlocks, block_medians, bridge_cells, count_scans, count_visibility
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import WEIGHT_UNIT, MeanRays, ReturnCells, merged_keys
@@ -100,7 +99,7 @@ class ReturnsOfCells:
         # sums 27 cells, of which a surface crosses nine: each gets nine times this variance, to keep the sum correct.
         pose_m2 = config.pose_sigma_m**2 + np.square(np.float32(config.pose_sigma_rad) * ranges_m)
         variances_m2 = 1 / self.information + CELLS_OF_SURFACE * pose_m2 / self.scans
-        return dataclasses.replace(self, information=(1 / variances_m2).astype(np.float32))
+        return replace(self, information=(1 / variances_m2).astype(np.float32))
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ the number of returns there nor the rays of other returns reveal that they are f
 
 import numpy as np
 
-from radarsdf._core import SurfelMap
 from radarsdf.arrays import Bools, Ints, Ints32
+from radarsdf.core import SurfelMap
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays

@@ -4,10 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from torch import Tensor
 
-from radarsdf.arrays import Array, Bools, Floats32, Ints, Keys
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats32, Ints, Keys
 from radarsdf.checks import check, real_array
 
 

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats
 from radarsdf.checks import one_for_each_scan, values_of_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.products import normal_matrix, product

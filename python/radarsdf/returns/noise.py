@@ -6,9 +6,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from radarsdf._core import move_onto_planes
 from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.core import move_onto_planes
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import WEIGHT_UNIT

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, cell_keys, principal_axes
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.core import CellBlocks, cell_keys, principal_axes
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import UPPER, ScanSums, merged_keys
 

@@ -1,19 +1,16 @@
 """Validation of radar scans and their conversion to rays in one local frame."""
 
-import dataclasses
 import functools
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import checks
-from radarsdf._core import hash_rays, scan_rays
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Keys
-from radarsdf.checks import positions as check_positions
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Floats32, Ints, Ints32, Keys, NDArray
+from radarsdf.core import hash_rays, scan_rays
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
 from radarsdf.rig import Rig
@@ -55,9 +52,7 @@ class Rays:
     @property
     def with_intensity(self) -> Bools:
         """Mask (N,) of the returns with an intensity that is not an outlier."""
-        if self.intensities is None:
-            return np.zeros(len(self), np.bool_)
-        return ~np.isnan(self.intensities)
+        return np.zeros(len(self), np.bool_) if self.intensities is None else ~np.isnan(self.intensities)
 
     def rows_of_sensors(self) -> list[slice | Ints]:
         if self.sensor_of_scan is None:
@@ -75,7 +70,7 @@ class Rays:
         kept, keys = self.intensities.copy(), self.hashes()
         for own in self.rows_of_sensors():  # each radar has its own unit
             kept[own] = Plausible.of(kept[own], keys[own]).kept(kept[own])
-        return dataclasses.replace(self, intensities=kept)
+        return replace(self, intensities=kept)
 
     def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> "Rays":
         """Select rays by a slice of step 1, a mask (N,) or row indices (M,), in this order."""
@@ -84,7 +79,7 @@ class Rays:
         for name, column in columns.items():
             # `take` with row indices needs a third of the time of indexing with them or a mask.
             columns[name] = column[rows] if isinstance(rows, slice) else column.take(rows, axis=0)
-        return dataclasses.replace(self, **columns)
+        return replace(self, **columns)
 
     def in_world(self) -> tuple[Floats, Floats]:
         """Return the returns and their sensor positions, (N, 3) each, float64, world, m."""
@@ -135,8 +130,8 @@ class LeftOut:
     given: int = 0  # number of rows
     rows: int = 0  # number of rows that are not returns: see :func:`measured`
     far: int = 0  # number of returns without others nearly as far: see :func:`too_far`
-    empty: list[int] = dataclasses.field(default_factory=list)  # scans without returns
-    poses: list[int] = dataclasses.field(default_factory=list)  # scans whose pose is not a rigid transform
+    empty: list[int] = field(default_factory=list)  # scans without returns
+    poses: list[int] = field(default_factory=list)  # scans whose pose is not a rigid transform
 
     @property
     def notes(self) -> list[str]:
@@ -230,7 +225,7 @@ def prepare(
     left_out.poses = np.flatnonzero(~rigid).tolist()
     positions = T_world_sensor[:, :3, 3]
     if origin is not None:
-        local_origin = check_positions(checks.real_array(origin, "origin")[None], "origin")[0]
+        local_origin = checks.positions(checks.real_array(origin, "origin")[None], "origin")[0]
     else:
         local_origin = positions.mean(axis=0)
         if lattice is not None:
@@ -241,9 +236,8 @@ def prepare(
     R, most_of_scan = T_world_sensor[:, :3, :3].reshape(-1, 9), np.where(rigid, most_m, -1.0)
     given = np.concatenate(scans), scan_of, R, positions - local_origin, seen_from - local_origin
     kept, points_m, directions, ranges_m = scan_rays(*given, min_range_m, most_of_scan, num_threads)
-    if len(ranges_m) == 0 and whole:
-        msg = f"none of {left_out.given} returns lies between {min_range_m} m and {most_m} m"
-        raise ValueError("; ".join([msg, *left_out.notes]))
+    none = f"none of {left_out.given} returns lies between {min_range_m} m and {most_m} m"
+    checks.check(len(ranges_m) or not whole, "; ".join([none, *left_out.notes]))
     for note in left_out.notes if whole else ():
         _LOG.warning(note)
     intensity = None if values is None else np.concatenate(values)[kept]

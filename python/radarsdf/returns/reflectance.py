@@ -9,11 +9,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
-from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints, Ints32, Keys, NDArray
 from radarsdf.checks import check
+from radarsdf.core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
 from radarsdf.products import normal_matrix, product
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays
@@ -72,11 +71,7 @@ def fit_response(values: Floats32, views: Views) -> tuple[Floats, Floats32]:
     coefficients[:, :_BASE] = regression(rays, y)
     left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
     table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
-    bins = _bins(_log_range(ranges_m), directions[:, 2])
-    returns = np.bincount(bins, minlength=table.size).reshape(TABLE_SHAPE)
-    # Within a standard deviation of the widest kernels from a return.
-    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
-    table[product(product(by_range, returns), by_elevation) <= 0] += _UNMEASURED
+    table[_far_from_returns(directions, ranges_m)] += _UNMEASURED
     for kind in (LEVEL, STEEP):
         own = chosen == kind
         if np.count_nonzero(own) >= _FEWEST:
@@ -187,6 +182,14 @@ def _smooth_means(bins: Ints32, values: Floats) -> Floats:
             smooth_sums, smooth_masses = (product(product(by_range, t), by_elevation) for t in tables)
             means = (smooth_sums + _TABLE_SHRINKAGE * means) / (smooth_masses + _TABLE_SHRINKAGE)
     return means
+
+
+def _far_from_returns(directions: Floats32, ranges_m: Floats32) -> Bools:
+    bins = _bins(_log_range(ranges_m), directions[:, 2])
+    returns = np.bincount(bins, minlength=TABLE_SHAPE[0] * TABLE_SHAPE[1]).reshape(TABLE_SHAPE)
+    # Beyond a standard deviation of the widest kernels.
+    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
+    return product(product(by_range, returns), by_elevation) <= 0
 
 
 def _kernels(widths: tuple[float, float]) -> list[Floats]:

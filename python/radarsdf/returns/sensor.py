@@ -1,16 +1,14 @@
 """Sensor model: field of view, resolution, detection threshold and noise, estimated from scans; and the radars of a rig."""
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
+from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Floats32, Ints
 from radarsdf.checks import check, not_negative, number, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.products import product
@@ -74,7 +72,7 @@ class Sensor:
             object.__setattr__(self, name, found)
         fits = 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7
         check(fits, f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}")
-        for value in dataclasses.astuple(self.noise):
+        for value in astuple(self.noise):
             not_negative(value, "noise")
         steps = tuple(_pair(step, "thresholds") for step in self.thresholds)
         fits = not any(a >= b for (a, _), (b, _) in itertools.pairwise(steps))
@@ -112,7 +110,7 @@ class Sensor:
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to a dict that JSON can store. :meth:`from_dict` is the inverse."""
-        described = dataclasses.asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
+        described = asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
         unit = described.pop("unit")
         return described if unit == SAME_UNIT else described | {"unit": list(unit)}
 
@@ -156,14 +154,8 @@ class Sensor:
         R = T_world_sensor[:, :3, :3]
         x, y, z = (sum(R[:, j, i][scans] * from_sensor[j] for j in range(3)) for i in range(3))
         range_m = np.sqrt(x * x + y * y + z * z)
-        thresholds: tuple[tuple[float, float], ...] = ()
-        if rays.intensities is not None:
-            values = rays.intensities[rows].astype(np.float64)
-            known = np.isfinite(values)
-            order = np.lexsort((values[known], range_m[known]))  # equal ranges in an order of their own
-            bins = [rows for rows in np.array_split(np.flatnonzero(known)[order], _RANGE_BINS) if len(rows)]
-            of_bins = ((np.median(range_m[rows]), np.quantile(values[rows], _WEAKEST)) for rows in bins)
-            thresholds = tuple(sorted({float(at_m): float(weakest) for at_m, weakest in of_bins}.items()))
+        values = rays.intensities
+        thresholds = () if values is None else _thresholds(range_m, values[rows].astype(np.float64))
         per_scan = np.bincount(rays.scans)
         return cls(
             azimuth_rad=_limits(np.arctan2(y, x)),
@@ -186,6 +178,15 @@ def _limits(values: Floats) -> tuple[float, float]:
     if low == high:  # very few returns
         low -= 1e-3 * max(abs(low), 1e-3)
     return float(low), float(high)
+
+
+def _thresholds(range_m: Floats, values: Floats) -> tuple[tuple[float, float], ...]:
+    """Return :attr:`Sensor.thresholds` of returns at ranges (N,), m, with intensities (N,), NaN where missing."""
+    known = np.isfinite(values)
+    order = np.lexsort((values[known], range_m[known]))  # equal ranges in an order of their own
+    bins = [rows for rows in np.array_split(np.flatnonzero(known)[order], _RANGE_BINS) if len(rows)]
+    of_bins = ((np.median(range_m[rows]), np.quantile(values[rows], _WEAKEST)) for rows in bins)
+    return tuple(sorted({float(at_m): float(weakest) for at_m, weakest in of_bins}.items()))
 
 
 _MOST_RETURNS = 60_000  # sample size
@@ -223,7 +224,7 @@ class Radars:
             values = rays.intensities.copy()
             for unit, rows in zip(units, rays.rows_of_sensors(), strict=True):
                 values[rows] = in_map_unit(values[rows], unit or SAME_UNIT)  # without a unit they stay
-            rays = dataclasses.replace(rays, intensities=values)
+            rays = replace(rays, intensities=values)
         return rays, cls(rig.labels, noise, units)
 
     def sensors(self, rays: Rays, poses: ArrayLike) -> dict[Label, Sensor]:
@@ -234,7 +235,7 @@ class Radars:
             if len(own := rays.select(rows)):
                 sensor, (gain, offset) = Sensor.of_rays(own, poses, noise), unit or SAME_UNIT
                 thresholds = tuple((range_m, gain * low + offset) for range_m, low in sensor.thresholds)
-                found[label] = dataclasses.replace(sensor, thresholds=thresholds, unit=(gain, offset))
+                found[label] = replace(sensor, thresholds=thresholds, unit=(gain, offset))
         return found
 
     def report(self, rays: Rays) -> dict[str, Any]:
@@ -243,7 +244,7 @@ class Radars:
         each = zip(self.labels, self.noise.of_sensors, self.units, rays.rows_of_sensors(), strict=True)
         for label, noise, unit, rows in each:
             gain, offset = unit or (None, None)
-            own = {"returns": len(rays.points[rows]), "noise": dataclasses.asdict(noise)}
+            own = {"returns": len(rays.points[rows]), "noise": asdict(noise)}
             found[str(label)] = own | {"intensity_gain": gain, "intensity_offset": offset}
         return found
 

@@ -5,8 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, CellSet, cell_keys, count_scans, mean_rays, merge_sums, sum_returns
 from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.core import CellBlocks, CellSet, cell_keys, count_scans, mean_rays, merge_sums, sum_returns
 from radarsdf.returns.rays import Rays
 
 MAX_CELLS_FROM_ORIGIN = 1_000_000

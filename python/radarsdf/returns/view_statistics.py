@@ -1,15 +1,13 @@
 """What grids and comparisons need of a map: free-space crossings of leaf cells, and mean intensities by place and view."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import cell_rows, find_free_space
-from radarsdf.arrays import AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.arrays import AnyFloats, ArrayLike, Bools, Bytes, Floats, Floats32, Ints, Ints32, Keys, NDArray
 from radarsdf.checks import check
+from radarsdf.core import cell_rows, find_free_space
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
@@ -135,7 +133,7 @@ class ViewStatisticsAt:
     sigma: float  # standard deviation of single returns from the mean of their group
 
     def select(self, chosen: Bools) -> "ViewStatisticsAt":
-        return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @classmethod
     def together(cls, parts: "Sequence[ViewStatisticsAt]") -> "ViewStatisticsAt":

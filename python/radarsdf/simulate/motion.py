@@ -6,11 +6,10 @@ from itertools import accumulate
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from radarsdf.arrays import Floats, Floats32
+from radarsdf.arrays import ArrayLike, Floats, Floats32
 from radarsdf.checks import check, check_poses, positive, real_array
 from radarsdf.poses.rigid import assembled, steps, transform
 from radarsdf.rig import Imu, Label, Rig, checked_rotation

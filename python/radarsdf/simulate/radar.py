@@ -6,11 +6,10 @@ from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import gammaincinv
 
-from radarsdf.arrays import Bools, Floats, Floats32, Ints
+from radarsdf.arrays import Bools, Floats, Floats32, Ints, NDArray
 from radarsdf.checks import check, check_poses, instance, whole_number
 from radarsdf.returns.sensor import Sensor
 from radarsdf.settings import settings
@@ -291,10 +290,7 @@ _LIDAR_STREAM = 2**31  # no scan has this index
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Simulated radar scans with poses and ground truth.
-
-    There are F scans, with N_i returns in scan i.
-    """
+    """Simulated radar scans with poses and ground truth."""
 
     points: list[Floats32]  # F arrays (N_i, 3), sensor frame, m
     poses: Floats  # (F, 4, 4) T_world_sensor, m

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager, suppress
-from os import PathLike
 from pathlib import Path
 
 import torch
@@ -104,7 +103,7 @@ def plan_tiles(
     check(fits, f"the halo, {halo_m:g} m, is larger than the tile, {tile_m:g} m: use larger tiles")
     grid = TileGrid(tile_m, halo_m, corner_m=float(config.lattice.position(0)))
     digest = hashlib.blake2b(digest_size=16)
-    given = checked_scans(read(scans) if isinstance(scans, (str, PathLike)) else scans, digest)
+    given = checked_scans(read(scans) if isinstance(scans, (str, os.PathLike)) else scans, digest)
     if not (folder / PLAN).is_file():
         folder.mkdir(exist_ok=True)
         others = {path.name for path in folder.iterdir()} - _OURS

@@ -4,17 +4,16 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf._core import marching_cubes_sparse
-from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Array, ArrayLike, Floats, Floats32, Ints, Ints32, Mesh
 from radarsdf.checks import check, check_box, hides_bar, positive
+from radarsdf.core import marching_cubes_sparse
 from radarsdf.io.files import check_outputs, reading, write_whole
 from radarsdf.io.meshes import MATT, T_GLTF_WORLD, encode_glb
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
@@ -26,9 +25,6 @@ from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_memory, check_views
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import TilePlan, folder_of
-
-if TYPE_CHECKING:
-    import trimesh
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
@@ -134,7 +130,7 @@ def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]
     return together, own[merged]
 
 
-def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> "trimesh.Trimesh":
+def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> Mesh:
     paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     file_bytes = sum(path.stat().st_size for path in paths)
     count, most = file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes

@@ -1,12 +1,11 @@
 """Plan of a tiled map: one JSON file shared by all tasks, and the paths of the tiles' files."""
 
-import dataclasses
 import hashlib
 import itertools
 import json
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -182,7 +181,7 @@ class Plan:
         return f"{self.digest} {tile.name}"
 
     def _to_json(self) -> bytes:
-        own = dataclasses.asdict(self) | {"sensor": self.sensor.to_dict()}
+        own = asdict(self) | {"sensor": self.sensor.to_dict()}
         own["radars"] = [vars(radar) | {"sensor": radar.sensor.to_dict()} for radar in self.radars]
         return json.dumps(FORMAT | own, indent=1).encode()
 

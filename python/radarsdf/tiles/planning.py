@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from radarsdf._core import cell_keys
 from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.checks import are_rigid, check, one_for_each_scan, restating
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.core import cell_keys
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible

@@ -212,13 +212,6 @@ def load(path: AnyPath) -> Map:
     return TiledMap(path) if path.is_dir() else RadarMap(load_contents(path))
 
 
-def lacking(radar_map: Map) -> str:
-    """Describe how many tiles a map lacks; empty if none."""
-    if not isinstance(radar_map, TiledMap) or not (missing := radar_map.missing):
-        return ""
-    return f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
-
-
 def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, Floats]:
     """Predicted intensities (N,) for rays, sensor units, and these rays: those in no tile are left out."""
     found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)

@@ -10,8 +10,8 @@ from radarsdf.arrays import Floats
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
 from radarsdf.checks import check
 from radarsdf.grids.grid import Grid
+from radarsdf.map.colors import SHARES
 from radarsdf.map.map import Map
-from radarsdf.render.figures import SHARES
 from radarsdf.scans import Scan, Scans
 from radarsdf.view.scene import SCAN_COLORS, Canvas, Painter, ScanClouds, State, add_cloud, add_mesh, add_path
 from radarsdf.view.serving import CameraPose, Page, aim, framing_pose
@@ -139,7 +139,7 @@ class Viewer(Page):
             boxes = {name: gui.add_checkbox(name, True) for name in colors}
 
         async def on_scan(_: Any) -> None:
-            sensor = clouds.sensor(int(slider.value))
+            sensor = tuple(scans.sensor_poses[int(slider.value), :3, 3].tolist())
             if self._gizmo is not None:
                 self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
             self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=_SLID_S)

@@ -5,18 +5,16 @@ between two meshes. So a step recolours a cloud of some vertices in place. After
 scene stays until the page has drawn it.
 """
 
-import dataclasses
 import threading
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from radarsdf.arrays import Array, Bytes, Floats, Ints
-from radarsdf.map.colors import NEUTRAL
+from radarsdf.map.colors import NEUTRAL, Scale
 from radarsdf.map.map import Map
-from radarsdf.render.figures import Scale
 from radarsdf.scans import Scans
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
 from radarsdf.view.surface import Position, Quantity, ShownSurface, glb, lightness_of, shaded, spread_evenly
@@ -57,7 +55,7 @@ class Painter:
     def change(self, **fields: Any) -> None:
         """Change fields of the state, from any thread, without waiting."""
         with self._changed:
-            self.newest = dataclasses.replace(self.newest, **fields)
+            self.newest = replace(self.newest, **fields)
             self._pending = True
             self._changed.notify_all()
 
@@ -187,11 +185,6 @@ class ScanClouds:
         path = scans.sensor_poses[:, :3, 3] - radar_map.origin
         self.nodes: dict[str, Any] = {"trajectory": add_path(server, "/scans/path", path, path_color)}
         self.show(0)
-
-    def sensor(self, index: int) -> Position:
-        """Sensor position of a scan, world, m."""
-        x, y, z = self._scans[index].T_world_sensor[:3, 3].tolist()
-        return x, y, z
 
     def show(self, index: int) -> None:
         if index == self._shown:

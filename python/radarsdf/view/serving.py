@@ -36,10 +36,6 @@ _TO_EYE = np.array([-0.33, -0.57, 0.5])
 _MARGIN = 1.08
 
 
-def require_viser() -> None:
-    require("viser", what="the viewer needs")
-
-
 def free_port(host: str, port: int | None, first: int | None = None) -> int:
     """Return `port`, or the first free one from `first`, 8080. Raise an OSError if there is none, for which viser would wait forever."""
     candidates = range(first := first or _FIRST_PORT, first + _PORTS_TRIED)
@@ -56,6 +52,12 @@ def free_port(host: str, port: int | None, first: int | None = None) -> int:
                 break
     msg = f"cannot listen on {host}, port {candidate}: {reason}; --host takes an address of this machine, --port a free port"
     raise OSError(msg)
+
+
+def page_port(host: str, port: int | None) -> int:
+    """Return the :func:`free_port` of a page. Raises an ImportError without viser."""
+    require("viser", what="the viewer needs")
+    return free_port(host, port)
 
 
 def refusal(hosts: Sequence[str], origins: Sequence[str], listening: str) -> str | None:
@@ -164,9 +166,7 @@ class Page:
     """A page served until it is stopped. Raises an OSError for a taken port before any work."""
 
     def __init__(self, host: str = LOCALHOST, port: int | None = None) -> None:
-        require_viser()
-        self.host = host
-        self.port = free_port(host, port)
+        self.host, self.port = host, page_port(host, port)
 
     def _start(self) -> None:
         self._server: Any = start_server(self.host, self.port)

@@ -21,7 +21,7 @@ from radarsdf.extras import require
 from radarsdf.grids.grid import Grid
 from radarsdf.io.files import checked_suffix, whole_file
 from radarsdf.io.ros2 import Node, Subscription, encode, make_message
-from radarsdf.render.figures import Scale
+from radarsdf.map.colors import Scale
 from radarsdf.scans import Scan
 from radarsdf.view.serving import LOCALHOST, free_port
 
@@ -231,8 +231,8 @@ def foxglove_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
     """Yield a sink that writes an MCAP file whole or not at all; without a path, one that serves this machine only, and its address."""
     foxglove = require("foxglove", what="Foxglove and MCAP files need")
     context = foxglove.Context()
+    checked_suffix(path, [".mcap"], "Foxglove")
     if path is not None:
-        checked_suffix(path, [".mcap"], "Foxglove")
         with whole_file(path) as file, foxglove.open_mcap(file, context=context) as written:
             yield FoxgloveSink(foxglove, context), ""
             with restating(f"{path} was not written", RuntimeError, kind=OSError):  # such as on a full disk
@@ -255,8 +255,8 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
     """Yield a sink that writes an .rrd file whole or not at all; without a path, a web viewer for this machine only, and its address."""
     rerun = require("rerun", what="rerun needs")
     stream = rerun.RecordingStream("radarsdf")
+    checked_suffix(path, [".rrd"], "rerun")
     if path is not None:
-        checked_suffix(path, [".rrd"], "rerun")
         with whole_file(path) as file, TemporaryDirectory(dir=path.absolute().parent) as folder:
             stream.save(growing := Path(folder) / "growing.rrd")
             yield RerunSink(rerun, stream), ""

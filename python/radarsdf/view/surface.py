@@ -8,16 +8,15 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf._core import SurfaceTracer
-from radarsdf.arrays import Array, Bools, Bytes, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Array, ArrayLike, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check
+from radarsdf.core import SurfaceTracer
 from radarsdf.io.meshes import MATT, SRGB_TO_LINEAR, encode_glb
+from radarsdf.map.colors import SHARES, Scale
 from radarsdf.map.map import Map
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
-from radarsdf.render.figures import SHARES, Scale
 
 Position = tuple[float, float, float]
 UNCERTAINTY = "uncertainty (standard error), m"
