@@ -106,8 +106,8 @@ def test_only_the_changed_part_of_a_long_drive_is_recomputed():
     live.mesh()
     live.integrate(SCENE.points[7], poses[6], SCENE.intensities[7])
     surface, changes, _ = live._state.changes()
-    redone = surface.update(*changes)
-    assert 0 < len(redone) < 0.4 * len(regions_of(surface.distances.gather()["keys"]))
+    regions = surface.update(*changes)
+    assert 0 < len(regions) < 0.4 * len(regions_of(surface.distances.gather()["keys"]))
     grown = mesh_bits(live.mesh())
     live._state._surface = None
     assert grown == mesh_bits(live.mesh())

@@ -304,16 +304,16 @@ class LiveMap:
             alike = state.with_intensities in (None, with_intensities)
             check(alike, "either all scans have intensities, or none has")
             steps = [] if given is not None else self._follower.seek(state.track, state.log, scan_id, scan)
-            come = {step.scan_id: replace(step.logged, pose=step.found.pose) for step in steps}
+            placed = {step.scan_id: replace(step.logged, pose=step.found.pose) for step in steps}
             if given is not None:
-                come[scan_id] = replace(scan, pose=given)
-            scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
+                placed[scan_id] = replace(scan, pose=given)
+            scan, moved = placed[scan_id], tuple(step.scan_id for step in steps[:-1])
             lattice, origin = self.config.lattice, state.origin
             if origin is None:
                 origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
             blocks = state.exchange(
-                come,
-                again,
+                placed,
+                moved,
                 origin=origin,
                 with_intensities=with_intensities,
                 next_id=max(state.next_id, scan_id + 1) if isinstance(scan_id, int) else state.next_id,
@@ -321,7 +321,7 @@ class LiveMap:
             )
             notes = self._follower.doubts(steps[-1]) if steps else ()
         moving = 0 if scan.is_static is None else int((~scan.is_static).sum())
-        return Integrated(scan_id, scan.pose.copy(), blocks, moving, again, far, notes)
+        return Integrated(scan_id, scan.pose.copy(), blocks, moving, moved, far, notes)
 
     def remove(self, scan_id: ScanId) -> Keys:
         """Remove a scan. The map is then bit-identical to one that never saw it.
@@ -390,8 +390,8 @@ class LiveMap:
             known = dict(zip(ids, refined.poses, strict=True))
             drifted = [placed for placed in now.trajectory() if placed.tracked]
             moved = {placed.scan_id: known.get(placed.scan_id, T @ placed.pose) for placed in drifted}
-            come = {k: replace(now.get(k), pose=pose) for k, pose in moved.items()}
-            return self._state.exchange(come, come)
+            replaced = {k: replace(now.get(k), pose=pose) for k, pose in moved.items()}
+            return self._state.exchange(replaced, replaced)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
         """Discard the map outside a ball. Scans that extend beyond it can no longer be moved or removed.

@@ -78,26 +78,26 @@ class GrowingState:
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
-    def exchange(self, come: _Scans, gone: Iterable[ScanId], **new: Any) -> Keys:
-        """Remove and insert scans, and set `new` attributes, atomically. Return the keys of the changed blocks."""
-        left = {scan_id: self.log.get(scan_id) for scan_id in gone}
-        new = {"origin": self.origin, "log": self.log.exchanged(come, left)} | new
-        before = {name: getattr(self, name) for name in new}
-        blocks = self._apply(come, left, new)
+    def exchange(self, added: _Scans, removed: Iterable[ScanId], **new: Any) -> Keys:
+        """Remove and add scans, and set `new` attributes, atomically. Return the keys of the changed blocks."""
+        before = {scan_id: self.log.get(scan_id) for scan_id in removed}
+        new = {"origin": self.origin, "log": self.log.exchanged(added, before)} | new
+        old = {name: getattr(self, name) for name in new}
+        blocks = self._apply(added, before, new)
         try:
-            if come:
+            if added:
                 self._bound()
         except BaseException:  # such as a full disk
-            self._apply(left, come, before)
+            self._apply(before, added, old)
             raise
         self.log.tidy()
         return blocks
 
-    def _apply(self, come: _Scans, gone: _Scans, new: dict[str, Any]) -> Keys:
+    def _apply(self, added: _Scans, removed: _Scans, new: dict[str, Any]) -> Keys:
         """Change the sums and set attributes atomically. Return the keys of the changed blocks."""
         edge_m = self.config.leaf_size_m
         changes = [SumsChange(edge_m, edge_m / QUANTA) for _ in self._labels]
-        for scans, sign in ((gone, -1), (come, 1)):
+        for scans, sign in ((removed, -1), (added, 1)):
             for scan in scans.values():
                 rays = self._rays_of([scan], self.origin if new["origin"] is None else new["origin"])
                 change = changes[self._labels.index(scan.label)]
@@ -133,9 +133,9 @@ class GrowingState:
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
             return self._put_away(regions[np.square(nearest - centre).sum(axis=1) > radius_m**2])
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
-        gone = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
+        far = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
         log = self.log.sealed_beyond(centre, radius_m)
-        return self._commit(self.sums.erase(gone), gone, log=log)
+        return self._commit(self.sums.erase(far), far, log=log)
 
     @contextmanager
     def whole(self) -> Iterator[None]:

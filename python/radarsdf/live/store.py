@@ -239,11 +239,11 @@ class ScanLog:
 
     def _without(self, held: Iterable[ScanId], *, sealed: bool = False) -> "ScanLog":
         """Return a log without the scans `held` in memory. `sealed`: these stay in the map."""
-        log, gone = copy(self), set(held)
+        log, emptied = copy(self), set(held)
         log._scans = self._scans.copy()
-        for scan_id in gone:
+        for scan_id in emptied:
             log.num_bytes -= log._scans.pop(scan_id).num_bytes
-        log.sealed = self.sealed | gone if sealed else self.sealed
+        log.sealed = self.sealed | emptied if sealed else self.sealed
         return log
 
     def _write(self, scans: Sequence[tuple[int, ScanId, LoggedScan]]) -> None:

@@ -240,12 +240,12 @@ class GrowingSurface:
         # cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
         band_cells = max(TRUNCATION_CELLS, BAND_CELLS)
         reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(band_cells) + 1)
-        leaf_keys, came_or_went = self._find_leaf_cells(regions_of(reached), num_threads)
-        reached = np.union1d(reached, cubes_near(came_or_went, _BLOCK_CELLS, 1))
+        leaf_keys, differing = self._find_leaf_cells(regions_of(reached), num_threads)
+        reached = np.union1d(reached, cubes_near(differing, _BLOCK_CELLS, 1))
         smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED))
-        redone = np.intersect1d(smoothed, regions_of(np.union1d(leaf_keys, came_or_went)))
-        self._average(redone, leaf_keys, noise, num_threads)
-        return redone
+        regions = np.intersect1d(smoothed, regions_of(np.union1d(leaf_keys, differing)))
+        self._average(regions, leaf_keys, noise, num_threads)
+        return regions
 
     def _find_leaf_cells(self, regions: Keys, num_threads: int) -> tuple[Keys, Keys]:
         """Find the leaf cells near `regions`, in which rays changed. Return them, and those that came or went, ascending."""
