@@ -321,7 +321,7 @@ def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Flo
 def search_near(
     index: SurfaceIndex, returns: SensorReturns, poses: Floats, guess: Floats, num_threads: int
 ) -> tuple[Floats, str]:
-    """Place a drive with poses (F, 4, 4) near `guess` (4, 4), if it agrees better with the map there than anywhere else.
+    """Place a drive with poses (F, 4, 4) near `guess` (4, 4), if it agrees better with the map there than elsewhere and by chance.
 
     Return the transform from the world of the drive to that of the map, and where the returns cannot tell, the guess and a note. Raise
     Lost if the drive clearly agrees better elsewhere.
@@ -338,10 +338,9 @@ def search_near(
             at = found.names
             msg = f"the scans agree better with the map at {at[k]} than at the guess, {at[0]}"
             raise found.lost(msg, k, 0)
-        rival = found.rival(0)
-        if rival is None:
+        if (why := found.refusal(0)) is None:
             return found.poses_of_frame[0], ""
-        note = f"The returns do not tell the guess, {found.names[0]}, from {found.names[rival]}."
+        note = f"The returns do not confirm the guess: {why}."
     return guess, note
 
 
@@ -412,13 +411,13 @@ class _Places:
         return Lost(message, self.poses_of_frame[[*places]], float(self.agreeing[places[0]]))
 
     def refusal(self, place: int) -> Lost | None:
-        """Return why the submap cannot be placed at its best place. None if it can."""
+        """Return why the submap cannot be placed there. None if it can."""
         at = self.names
         if (k := self.rival(place)) is not None:
             words = f"two places of the map fit about equally well: {at[place]} and {at[k]}"
             return self.lost(words, place, k)
         if self._log_odds(place)[1] <= _LOG_ODDS:
-            words = f"the surfaces around the best place, {at[place]}, may agree with the map by chance"
+            words = f"the surfaces around {at[place]} may agree with the map by chance"
             return self.lost(words, place)
         return None
 
