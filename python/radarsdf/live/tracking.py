@@ -23,9 +23,10 @@ from radarsdf.poses.doppler import (
     SensorVelocities,
     upright,
 )
+from radarsdf.poses.imu import FIRST_BIAS_RAD_S, Gyroscope, Inertial
 from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.planes import LEAST_OBSERVED, Tracked, plane_cell_m
-from radarsdf.poses.rigid import rotation_vector
+from radarsdf.poses.rigid import rotation_vector, step_vectors
 from radarsdf.poses.search import Lost
 from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Tracker, rates_of, track_drive
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
@@ -213,6 +214,14 @@ class Follower:
         fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
         yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
         drive = Drive(scans, times_s, velocities, yaws=yaws)
+        if (
+            new.logged.radar is not None
+        ):  # turns of a narrow radar are those of the body, which all radars show
+            mounting = new.logged.radar.T_body_sensor
+            turns = step_vectors(np.stack([step.found.pose @ mounting for step in steps]))[:, 3:]
+            unbiased = MotionRate(np.zeros(3), FIRST_BIAS_RAD_S**2 * np.eye(3))
+            gyroscope = Gyroscope(turns, np.diff(times_s), unbiased)
+            drive = dataclasses.replace(drive, inertial=Inertial(gyroscope))
         tested = Consistency.of_returns(drive, self.config)
         trusted, notes = tested.applied(velocities)
         begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
