@@ -144,7 +144,8 @@ class Follower:
             raise ValueError(msg)
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
-        by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
+        measured = any(step.velocity is not None for step in [*self._steps, new][-self.num_radars :])
+        by_doppler = measured and (found[-1].sign != 0 or not new.moves)
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
         sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
         sign_open = sign_open and len(self._of_radar(new)) > 1  # other radars see other places
@@ -314,8 +315,9 @@ class Follower:
         return dataclasses.replace(new, found=found, pull=pull, sign=sign)
 
     def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
-        """Return the velocities of scans. None if one of the last two has none."""
-        if any(step.velocity is None for step in steps[-2:]):
+        """Return the velocities of scans. None if one of the last two has none; of a rig, if all have none."""
+        rig, measured = _rig_of(steps), np.array([step.velocity is not None for step in steps])
+        if not (measured[-2:].all() if rig is None else measured.any()):
             return None
         each = [
             (np.zeros(3), np.eye(3)) if one is None else (one.velocity_mps, _covariance(one))
@@ -324,15 +326,14 @@ class Follower:
         mean, covariance, _ = upright(*(np.array(columns) for columns in zip(*each, strict=True)))
         own = self._of_radar(steps[-1])
         known = [(one.time_s, one.velocity.velocity_mps) for one in own if one.velocity]
-        times_s, speeds = (np.array(columns) for columns in zip(*known, strict=True))
         change = MOVES.change
         if len(known) > 1:
+            times_s, speeds = (np.array(columns) for columns in zip(*known, strict=True))
             change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (times_s[-1] - times_s[0])
         found = np.ones(len(steps), bool)
         velocities = _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, found), sign)
-        if (rig := _rig_of(steps)) is None:
+        if rig is None:
             return velocities
-        measured = np.array([step.velocity is not None for step in steps])
         parts = [rows[measured[rows]] for rows in rig.scans_of_radars().values()]
         radars = [(rows, velocities.select(rows)) for rows in parts if len(rows)]
         return BodyVelocities.of_radars(rig, radars, np.array([step.time_s for step in steps]))
