@@ -144,8 +144,7 @@ class Follower:
             raise ValueError(msg)
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
-        measured = any(step.velocity is not None for step in [*self._steps, new][-self.num_radars :])
-        by_doppler = measured and (found[-1].sign != 0 or not new.moves)
+        by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
         sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
         sign_open = sign_open and len(self._of_radar(new)) > 1  # other radars see other places
