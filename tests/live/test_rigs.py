@@ -1,12 +1,16 @@
 """Live maps of several radars: tracking of the body, sums at the poses of the radars, and files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
 from radarsdf.poses.rigid import aligned
+from radarsdf.simulate import simulate_rig
 
-from scenes.rigs import drive_of_rig
+from scenes.kinds import KINDS
+from scenes.rigs import FRAME_S, drive_of_rig, three_radars
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +70,16 @@ def test_the_noise_of_radars_that_take_turns_is_that_of_each(scans, monkeypatch)
     assert rear.range_m > 1.5 * front.range_m  # twice, by construction
 
 
-def test_the_body_is_tracked_by_all_radars(scans):
+def test_the_body_is_tracked_by_radars_whose_scans_are_close():
+    """Regression: from 8 scans 0.4 m apart, narrow radars seemed to contradict right Doppler: two thirds were lost."""
+    drive = KINDS["yard"](seed=0)
+    radars = {label: replace(radar, rate_hz=20.0) for label, radar in three_radars(drive.sensor).items()}
+    scans = simulate_rig(drive.scene, radars, drive.poses[:18], FRAME_S * np.arange(18)).scans
     live = LiveMap(T_body_sensor=scans.T_body_sensor)
-    for i in range(30):
+    for i in range(90):
         integrate(live, scans, i)
-    placed = aligned(np.stack([live.pose(i) for i in range(30)]), scans.poses[:30])
-    assert np.linalg.norm((placed - scans.poses[:30])[:, :3, 3], axis=1).max() < 0.25
+    placed = aligned(np.stack([live.pose(i) for i in range(90)]), scans.poses[:90])
+    assert np.linalg.norm((placed - scans.poses[:90])[:, :3, 3], axis=1).max() < 0.1
 
 
 def test_each_scan_needs_the_label_of_its_radar(scans):

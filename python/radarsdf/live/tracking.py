@@ -23,9 +23,10 @@ from radarsdf.poses.doppler import (
     SensorVelocities,
     upright,
 )
+from radarsdf.poses.imu import FIRST_BIAS_RAD_S, Gyroscope, Inertial
 from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.planes import LEAST_OBSERVED, Tracked, plane_cell_m
-from radarsdf.poses.rigid import rotation_vector
+from radarsdf.poses.rigid import rotation_vector, step_vectors
 from radarsdf.poses.search import Lost
 from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Tracker, rates_of, track_drive
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
@@ -213,6 +214,14 @@ class Follower:
         fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
         yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
         drive = Drive(scans, times_s, velocities, yaws=yaws)
+        if (
+            new.logged.radar is not None
+        ):  # turns of a narrow radar are those of the body, which all radars show
+            mounting = new.logged.radar.T_body_sensor
+            turns = step_vectors(np.stack([step.found.pose @ mounting for step in steps]))[:, 3:]
+            unbiased = MotionRate(np.zeros(3), FIRST_BIAS_RAD_S**2 * np.eye(3))
+            gyroscope = Gyroscope(turns, np.diff(times_s), unbiased)
+            drive = dataclasses.replace(drive, inertial=Inertial(gyroscope))
         tested = Consistency.of_returns(drive, self.config)
         trusted, notes = tested.applied(velocities)
         begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
@@ -305,8 +314,9 @@ class Follower:
         return dataclasses.replace(new, found=found, pull=pull, sign=sign)
 
     def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
-        """Return the velocities of scans. None if one of the last two has none."""
-        if any(step.velocity is None for step in steps[-2:]):
+        """Return the velocities of scans. None if one of the last two has none; of a rig, if all have none."""
+        rig, measured = _rig_of(steps), np.array([step.velocity is not None for step in steps])
+        if not (measured[-2:].all() if rig is None else measured.any()):
             return None
         each = [
             (np.zeros(3), np.eye(3)) if one is None else (one.velocity_mps, _covariance(one))
@@ -315,15 +325,14 @@ class Follower:
         mean, covariance, _ = upright(*(np.array(columns) for columns in zip(*each, strict=True)))
         own = self._of_radar(steps[-1])
         known = [(one.time_s, one.velocity.velocity_mps) for one in own if one.velocity]
-        times_s, speeds = (np.array(columns) for columns in zip(*known, strict=True))
         change = MOVES.change
         if len(known) > 1:
+            times_s, speeds = (np.array(columns) for columns in zip(*known, strict=True))
             change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (times_s[-1] - times_s[0])
         found = np.ones(len(steps), bool)
         velocities = _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, found), sign)
-        if (rig := _rig_of(steps)) is None:
+        if rig is None:
             return velocities
-        measured = np.array([step.velocity is not None for step in steps])
         parts = [rows[measured[rows]] for rows in rig.scans_of_radars().values()]
         radars = [(rows, velocities.select(rows)) for rows in parts if len(rows)]
         return BodyVelocities.of_radars(rig, radars, np.array([step.time_s for step in steps]))

@@ -156,7 +156,8 @@ def delay_of(
         at = np.clip(rows + delay, 0, last)
         known = (at == rows + delay) & (runs[at] == runs[rows])
         used = followed & known[:-1] & known[1:]
-        if (count := int(used.sum())) < FEWEST_STEPS:
+        # Longer delays are compared in so few steps that most drives would not exclude them, and some seem to show them.
+        if (count := int(used.sum())) < FEWEST_STEPS or 3 * count <= 2 * followed.sum():
             continue
         delayed = replace(motion.velocities, mean_mps=velocities.mean_mps[at])
         turned = replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
@@ -168,12 +169,13 @@ def delay_of(
         left, change, expected = (v - scaled * (v * scaled).sum() / square for v in others)
         share, error, remaining = slope_of(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
+        delays, expected_error, _ = slope_of(expected, left)
         # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
-        if share > max(needed * error, 0.5) and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
+        # These are also several times as large as a delay explains.
+        likely = share > max(needed * error, 0.5) and abs(delays - 1) < 0.5
+        if likely and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))
-        share, error, _ = slope_of(expected, left)
-        # Longer delays are compared in so few steps that most drives would not exclude them.
-        if share + needed * error >= 1 and 3 * count > 2 * followed.sum():
+        if delays + needed * expected_error >= 1:
             possible.append(delay)
     return min(found)[1], tuple(possible)
 
@@ -236,8 +238,9 @@ class Consistency:
         free = compared.scaled(1.0, _FREE_SCALE)
         free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config)
-        yaws = drive.yaws if every == 1 else None
-        tracked, _ = track_once(Drive(scans, times_s, free, yaws=yaws), tracker)
+        sampled = drive if every == 1 else Drive(scans, times_s, None)  # turns are known between neighbours
+        yaws = sampled.yaws
+        tracked, _ = track_once(replace(sampled, velocities=free), tracker)
         filled = np.array([len(scan) > 0 for scan in scans])
         usable = (np.diff(runs_of(times_s)) == 0) & filled[1:] & filled[:-1]
         if usable.sum() < FEWEST_STEPS:
@@ -386,11 +389,13 @@ class _Pairs:
         """Yield the evidence of other motions than that by Doppler, significant above 1, and the ratios of their speeds to its."""
         yield -float(Gain.of_samples(self.gains[:, _SAME]).excess(level)), -1.0
         share, limit = self.tracked(level)
-        means = self.gains.mean(axis=0)
+        # Noise of returns that hides steps lets gains grow beyond the right scale, but nowhere faster than the scale.
+        gains = self.gains / np.maximum(_SCALES, 1.0)
+        means = gains.mean(axis=0)
         best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
         # Of a radar that is too narrow, gains increase up to the end of the scales.
         if best not in (here, 0, len(_SCALES) - 1) and abs(share) + limit >= _SAME_SCALE - 1:
-            loss = self.gains[:, best] - self.gains[:, here]
+            loss = gains[:, best] - gains[:, here]
             yield float(Gain.of_samples(loss).excess(level / len(_SCALES))), float(_SCALES[best])
         # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
         other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
