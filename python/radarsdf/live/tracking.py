@@ -214,11 +214,9 @@ class Follower:
         fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
         yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
         drive = Drive(scans, times_s, velocities, yaws=yaws)
-        if (
-            new.logged.radar is not None
-        ):  # turns of a narrow radar are those of the body, which all radars show
-            mounting = new.logged.radar.T_body_sensor
-            turns = step_vectors(np.stack([step.found.pose @ mounting for step in steps]))[:, 3:]
+        if (radar := new.logged.radar) is not None:
+            # A narrow radar hardly shows its turns, but all radars show those of the body.
+            turns = step_vectors(np.stack([step.found.pose @ radar.T_body_sensor for step in steps]))[:, 3:]
             unbiased = MotionRate(np.zeros(3), FIRST_BIAS_RAD_S**2 * np.eye(3))
             gyroscope = Gyroscope(turns, np.diff(times_s), unbiased)
             drive = dataclasses.replace(drive, inertial=Inertial(gyroscope))
