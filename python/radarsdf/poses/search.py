@@ -412,11 +412,11 @@ class _Places:
 
     def refusal(self, place: int) -> Lost | None:
         """Return why the submap cannot be placed there. None if it can."""
-        at = self.names
-        if (k := self.rival(place)) is not None:
-            words = f"two places of the map fit about equally well: {at[place]} and {at[k]}"
-            return self.lost(words, place, k)
-        if self._log_odds(place)[1] <= _LOG_ODDS:
+        at, (odds, of_chance) = self.names, self._log_odds(place)
+        if rivals := [k for k in self.elsewhere(place) if odds[k] <= _LOG_ODDS]:
+            words = f"two places of the map fit about equally well: {at[place]} and {at[rivals[0]]}"
+            return self.lost(words, place, rivals[0])
+        if of_chance <= _LOG_ODDS:
             words = f"the surfaces around {at[place]} may agree with the map by chance"
             return self.lost(words, place)
         return None
@@ -430,11 +430,6 @@ class _Places:
     def points_at(self, place: int) -> Floats:
         pose = self.poses[place]
         return self.points @ pose[:3, :3].T + pose[:3, 3]
-
-    def rival(self, place: int) -> int | None:
-        """Return another place with which the submap does not clearly agree less."""
-        odds, _ = self._log_odds(place)
-        return next((k for k in self.elsewhere(place).tolist() if odds[k] <= _LOG_ODDS), None)
 
     def _log_odds(self, place: int) -> tuple[Floats, float]:
         """Return the log likelihood ratios of a place to each place (K,), and to none of them.
