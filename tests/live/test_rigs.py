@@ -1,5 +1,6 @@
 """Live maps of several radars: tracking of the body, sums at the poses of the radars, and files."""
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
 from radarsdf.poses.rigid import aligned
+from radarsdf.poses.search import Lost
 from radarsdf.simulate import simulate_rig
 
 from scenes.kinds import KINDS
@@ -80,6 +82,24 @@ def test_the_body_is_tracked_by_radars_whose_scans_are_close():
         integrate(live, scans, i)
     placed = aligned(np.stack([live.pose(i) for i in range(90)]), scans.poses[:90])
     assert np.linalg.norm((placed - scans.poses[:90])[:, :3, 3], axis=1).max() < 0.1
+
+
+def test_a_slow_rig_is_tracked_from_the_start():
+    """Regression: before the sign of the Doppler was known, scans that returns alone do not place were refused, also all later ones."""
+    drive = radarsdf.simulate.oculii(seed=2)
+    radars = three_radars(drive.sensor).items()
+    radars = {
+        label: replace(radar, rate_hz=20.0, first_s=0.017 * k) for k, (label, radar) in enumerate(radars)
+    }
+    scans = simulate_rig(drive.scene, radars, drive.poses[:12], FRAME_S * np.arange(12)).scans
+    live = LiveMap(T_body_sensor=scans.T_body_sensor)
+    for i in range(50):
+        with contextlib.suppress(Lost):
+            integrate(live, scans, i)
+    ids = list(live.scan_ids)
+    placed = aligned(np.stack([live.pose(i) for i in ids]), scans.poses[ids])
+    assert len(ids) > 45
+    assert np.linalg.norm((placed - scans.poses[ids])[:, :3, 3], axis=1).max() < 0.05
 
 
 def test_each_scan_needs_the_label_of_its_radar(scans):

@@ -145,12 +145,13 @@ class Follower:
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
-        observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
+        fewest = _OBSERVED_STEPS * self.num_radars  # beyond the initialisation, which decides the sign
+        observed = [step.found.observed[0] for step in self._steps if not step.given][-fewest:]
         sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
         sign_open = sign_open and len(self._of_radar(new)) > 1  # other radars see other places
         unlike = sign_open and found[-1].found.agreeing < _LEAST_AGREEING
         elsewhere = unlike or any(step.found.segment for step in found)
-        unobserved = len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED
+        unobserved = len(observed) == fewest and np.median(observed) < LEAST_OBSERVED
         if elsewhere or (unobserved and not by_doppler):
             nowhere = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
             why = nowhere if elsewhere else "the returns alone do not observe the motion of the sensor"
@@ -380,11 +381,12 @@ class Follower:
         if measured:
             evidence = sum(gains) / np.sqrt(len(gains))
             # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Where returns do not show
-            # it, as in a tunnel, this one is assumed: each comparison with the returns then states the doubt.
+            # it, as in a tunnel, that of odometry is assumed: each comparison with the returns then states the doubt.
+            if abs(evidence) <= CLEAR and len(steps) == _START * self.num_radars:
+                evidence = np.inf
             likelier = sign or int(np.sign(evidence))
             yaws = yaws[::-1] if evidence < 0 else yaws
-            decided = abs(evidence) > CLEAR or len(steps) == _START * self.num_radars
-            sign = sign or (likelier if decided else 0)
+            sign = sign or (likelier if abs(evidence) > CLEAR else 0)
             # By the prior alone, a vehicle that turns by 13 degrees between the first scans would be lost.
             known = yaws if turns_fast(yaws[0]) else None
             signed = [(rows, _signed(found, likelier)) for rows, found in measured]
