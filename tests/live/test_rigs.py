@@ -20,6 +20,13 @@ def scans():
     return drive_of_rig(radarsdf.simulate.hugin(seed=6, frames=16), seed=2).scans
 
 
+def three_at_20_hz(drive, frames, apart_s=0.0):
+    """Scans of three radars that begin `apart_s` after each other."""
+    radars = enumerate(three_radars(drive.sensor).items())
+    radars = {label: replace(radar, rate_hz=20.0, first_s=apart_s * k) for k, (label, radar) in radars}
+    return simulate_rig(drive.scene, radars, drive.poses[:frames], FRAME_S * np.arange(frames)).scans
+
+
 def integrate(live, scans, i, pose=None):
     return live.integrate(
         scans.points[i],
@@ -74,9 +81,7 @@ def test_the_noise_of_radars_that_take_turns_is_that_of_each(scans, monkeypatch)
 
 def test_the_body_is_tracked_by_radars_whose_scans_are_close():
     """Regression: from 8 scans 0.4 m apart, narrow radars seemed to contradict right Doppler: two thirds were lost."""
-    drive = KINDS["yard"](seed=0)
-    radars = {label: replace(radar, rate_hz=20.0) for label, radar in three_radars(drive.sensor).items()}
-    scans = simulate_rig(drive.scene, radars, drive.poses[:18], FRAME_S * np.arange(18)).scans
+    scans = three_at_20_hz(KINDS["yard"](seed=0), 18)
     live = LiveMap(T_body_sensor=scans.T_body_sensor)
     for i in range(90):
         integrate(live, scans, i)
@@ -86,12 +91,7 @@ def test_the_body_is_tracked_by_radars_whose_scans_are_close():
 
 def test_a_slow_rig_is_tracked_from_the_start():
     """Regression: before the sign of the Doppler was known, scans that returns alone do not place were refused, also all later ones."""
-    drive = radarsdf.simulate.oculii(seed=2)
-    radars = three_radars(drive.sensor).items()
-    radars = {
-        label: replace(radar, rate_hz=20.0, first_s=0.017 * k) for k, (label, radar) in enumerate(radars)
-    }
-    scans = simulate_rig(drive.scene, radars, drive.poses[:12], FRAME_S * np.arange(12)).scans
+    scans = three_at_20_hz(radarsdf.simulate.oculii(seed=2), 12, apart_s=0.017)
     live = LiveMap(T_body_sensor=scans.T_body_sensor)
     for i in range(50):
         with contextlib.suppress(Lost):

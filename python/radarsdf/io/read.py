@@ -7,8 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import ArrayLike
-
+from radarsdf.arrays import ArrayLike
 from radarsdf.checks import AnyPath, check, check_pose, path_of, positions, positive
 from radarsdf.io import poses as pose_files
 from radarsdf.io import recordings

@@ -7,13 +7,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 from scipy.stats import t as student
 from typing_extensions import Self
 
-from radarsdf.arrays import Array, Bools, Floats, Ints
+from radarsdf.arrays import Array, Bools, Floats, Ints, NDArray
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import assembled, between, rotation

@@ -239,7 +239,6 @@ class Consistency:
         free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config)
         sampled = drive if every == 1 else Drive(scans, times_s, None)  # turns are known between neighbours
-        yaws = sampled.yaws
         tracked, _ = track_once(replace(sampled, velocities=free), tracker)
         filled = np.array([len(scan) > 0 for scan in scans])
         usable = (np.diff(runs_of(times_s)) == 0) & filled[1:] & filled[:-1]
@@ -259,7 +258,8 @@ class Consistency:
         along = np.where(followed & (seen > _LEAST_SEEN), along / np.maximum(seen, _LEAST_SEEN), np.nan)
         rows_of_pairs = np.flatnonzero(usable)  # also where tracking was lost: by wrong Doppler, it may be
         rows_of_pairs = rows_of_pairs[:: -(-len(rows_of_pairs) // _PAIRS)]
-        pairs = _Pairs.of(scans, motion, along, rows_of_pairs, None if yaws is None else yaws[1])
+        reversed_yaws = None if sampled.yaws is None else sampled.yaws[1]
+        pairs = _Pairs.of(scans, motion, along, rows_of_pairs, reversed_yaws)
         delay, possible = 0, tuple[int, ...]()
         if every <= MOST_LATE:
             # The fastest steps: of slow ones, errors of the returns seem delays.

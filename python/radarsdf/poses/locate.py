@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import ArrayLike, Floats, Ints
 from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.map import Map

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from radarsdf.arrays import Floats, Ints
+from radarsdf.arrays import ArrayLike, Floats, Ints
 from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import ERRORS, motion_significance

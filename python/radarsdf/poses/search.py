@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Mesh
 from radarsdf.checks import check
 from radarsdf.io.files import reading
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
@@ -22,9 +22,6 @@ from radarsdf.map.map import Map
 from radarsdf.poses.planes import PlaneMap, SensorReturns, apart_m
 from radarsdf.poses.rigid import rotation, transform
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
-
-if TYPE_CHECKING:
-    import trimesh
 
 _SAMPLED, _NEIGHBOURS = 2000, 20  # vertices of a map and their neighbours, as many as those of a plane
 _ARRAYS: dict[str, tuple[Any, ...]] = {
@@ -132,7 +129,7 @@ class SurfaceIndex:
         return cls.of_mesh(radar_map.mesh(leaf_m, progress=False), leaf_m)
 
     @classmethod
-    def of_mesh(cls, mesh: "trimesh.Trimesh", leaf_m: float) -> "SurfaceIndex":
+    def of_mesh(cls, mesh: Mesh, leaf_m: float) -> "SurfaceIndex":
         """Build from the mesh of a map of leaf cells of `leaf_m`, with `uncertainty_m` of its vertices."""
         check(len(mesh.faces) != 0, "the map has no surface")
         origin = np.asarray(mesh.vertices, np.float64).mean(axis=0)

@@ -4,10 +4,9 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from radarsdf.arrays import Floats
+from radarsdf.arrays import Floats, NDArray
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import YAW_STEP_RAD
