@@ -8,7 +8,6 @@ import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 from urllib.parse import quote
 
@@ -257,14 +256,12 @@ def rerun_sink(path: Path | None) -> Iterator[tuple[Sink, str]]:
     stream = rerun.RecordingStream("radarsdf")
     checked_suffix(path, [".rrd"], "rerun")
     if path is not None:
-        with whole_file(path) as file, TemporaryDirectory(dir=path.absolute().parent) as folder:
-            stream.save(growing := Path(folder) / "growing.rrd")
+        with whole_file(path) as file:
+            stream.save(file.name)
             yield RerunSink(rerun, stream), ""
             with restating(f"{path} was not written", RuntimeError, kind=OSError):
                 stream.flush()
             stream.disconnect()
-            with growing.open("rb") as written:
-                shutil.copyfileobj(written, file)
         return
     port = free_port(LOCALHOST, None, 9876)
     page = free_port(LOCALHOST, None, port + 1)
