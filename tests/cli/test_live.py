@@ -14,7 +14,9 @@ import radarsdf
 from radarsdf.cli.live import replay
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scan, Scans
-from radarsdf.view.sinks import FREE_COLOR, foxglove_sink, rerun_sink
+from radarsdf.view.foxglove import foxglove_sink
+from radarsdf.view.rerun import rerun_sink
+from radarsdf.view.sinks import FREE_COLOR
 
 from ..conftest import ground_and_wall
 from .calls import refusal, values
@@ -181,8 +183,8 @@ def test_viewers_are_served_to_this_machine_only(open_sink, library):
             time.sleep(0.1)
         return {answers("127.0.0.1", port) for port in ports} == {wanted}
 
-    with open_sink(None) as (_, url):
-        ports = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", url)]
+    with open_sink(None) as sink:
+        ports = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", sink.url)]
         assert len(ports) >= 1
         assert all_answer(ports, True)
         assert not any(answers("127.0.0.2", port) for port in ports)  # also this machine, on Linux
@@ -192,10 +194,10 @@ def test_viewers_are_served_to_this_machine_only(open_sink, library):
 def test_a_viewer_that_connects_later_sees_the_last_messages():
     pytest.importorskip("foxglove")
     connect = pytest.importorskip("websockets.sync.client").connect
-    with foxglove_sink(None) as (sink, url):
+    with foxglove_sink(None) as sink:
         for time_s in (1.0, 2.0):
             sink.show_scan(Scan(SCENE.points[0], SCENE.poses[0]), time_s)
-        with connect(url, subprotocols=["foxglove.sdk.v1"]) as server:
+        with connect(sink.url, subprotocols=["foxglove.sdk.v1"]) as server:
             advertised = next(said for said in map(json.loads, server) if said["op"] == "advertise")
             wanted = [{"id": one["id"], "channelId": one["id"]} for one in advertised["channels"]]
             server.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))

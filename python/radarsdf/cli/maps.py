@@ -35,7 +35,7 @@ from radarsdf.returns.moving import rays_as_measured
 from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import ChangesView, Viewer
-from radarsdf.view.serving import has_display, page_port, url_of, wait
+from radarsdf.view.serving import has_display, page_port, wait
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
@@ -143,10 +143,9 @@ def view(given: Namespace, results: Results) -> None:
     options = {"box": given.box, "progress": results.progress, "explained": explained}
     page = {"voxel_size": given.voxel, "host": given.host, "port": given.port}
     with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer, results.until_stopped():
-        url = url_of(viewer.host, viewer.port)
-        results.say(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it")
+        results.say(f"{len(viewer.surface.vertices)} vertices on {viewer.url}; Ctrl-C ends it")
         if has_display() if given.open is None else given.open:
-            webbrowser.open(url)
+            webbrowser.open(viewer.url)
         viewer.wait()
 
 
@@ -218,7 +217,7 @@ def compare(given: Namespace, results: Results) -> None:
     if given.view:
         page = ChangesView(changes, regions, edge_m, host=given.host, port=given.port)
         with page, results.until_stopped():
-            results.say(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it")
+            results.say(f"changes on {page.url}; Ctrl-C ends it")
             wait()
 
 
