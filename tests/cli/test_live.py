@@ -133,6 +133,9 @@ def test_mcap_readers_decode_what_is_shown(recording, capsys):
     assert tuple(cells[z[inside][0], y[inside][0], x[inside][0]]) == (*FREE_COLOR, 40)
     grid = messages["/grid", "Grid"][-1][1]
     assert len(grid.data) == space.row_count * space.column_count * grid.cell_stride
+    assert (
+        grid.pose.position.z == pytest.approx(0, abs=0.05) != space.pose.position.z
+    )  # the ground, not the box
 
 
 def test_rerun_reads_what_is_shown(recording, capsys):

@@ -69,8 +69,9 @@ class FoxgloveSink(Sink):
         rows = {"row_count": cells.shape[1], "cell_size": of.Vector3(x=size_m, y=size_m, z=size_m)}
         self._log_cells("/free_space", of.VoxelGrid, time_s, cells, **place, **rows)
         with contextlib.suppress(ValueError):  # without ground
-            size = of.Vector2(x=size_m, y=size_m)
-            self._log_cells("/grid", of.Grid, time_s, _cells(grid.flat().state), **place, cell_size=size)
+            flat, size = grid.flat(), of.Vector2(x=size_m, y=size_m)
+            place["pose"] = self._pose(np.append(flat.origin, flat.ground_m))
+            self._log_cells("/grid", of.Grid, time_s, _cells(flat.state), **place, cell_size=size)
 
     def _log_cells(self, topic: str, schema: Any, time_s: float, cells: Array, **values: Any) -> None:
         """Log an array of records (N,), (Y, X) or (Z, Y, X)."""
