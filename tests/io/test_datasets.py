@@ -49,7 +49,7 @@ def tum_rows(times_s=TIMES_S, poses=POSES):
 
 
 def name_of(folder):
-    return find_dataset(folder).name
+    return find_dataset(folder)
 
 
 @pytest.fixture
