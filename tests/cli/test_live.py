@@ -105,9 +105,8 @@ def test_mcap_readers_decode_what_is_shown(recording, capsys):
         assert [message.log_time for message, _ in messages[key]] == [round(1e8 * i) for i in range(6)]
     cloud = messages[one_each[2]][3][1]
     rows = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)
-    np.testing.assert_array_equal(
-        rows, np.column_stack([SCENE.points[3], SCENE.intensities[3]]).astype(np.float32)
-    )
+    expected = np.column_stack([SCENE.points[3], SCENE.intensities[3]]).astype(np.float32)
+    np.testing.assert_array_equal(rows, expected)
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "intensity"]
     assert messages[one_each[0]][3][1].translation.x == SCENE.poses[3, 0, 3]
     entity = messages["/surface", "SceneUpdate"][-1][1].entities[0]
@@ -120,22 +119,18 @@ def test_mcap_readers_decode_what_is_shown(recording, capsys):
     assert (vertices.max(axis=0) < mesh.bounds[1] + 1).all()
     assert [point.x for point in entity.lines[0].points] == SCENE.poses[:, 0, 3].tolist()
     space = messages["/free_space", "VoxelGrid"][-1][1]
-    cells = np.frombuffer(space.data, "u1").reshape(
-        -1, space.row_count, space.column_count, space.cell_stride
-    )
+    shape = -1, space.row_count, space.column_count, space.cell_stride
+    cells = np.frombuffer(space.data, "u1").reshape(shape)
     assert (space.slice_stride, space.row_stride) == cells.strides[:2]
     origin = np.array([getattr(space.pose.position, axis) for axis in "xyz"])
-    ahead = np.array(
-        [[12.0, 0.0, 1.0], [30.0, 0.0, 1.0], [14.0, 0.0, 0.01]]
-    )  # free, hidden by the wall, ground
+    ahead = np.array([[12.0, 0.0, 1.0], [30.0, 0.0, 1.0], [14.0, 0.0, 0.01]])  # free, behind the wall, ground
     x, y, z = np.floor((ahead - origin) / space.cell_size.x).astype(int).T
     inside = x < space.column_count
     assert tuple(cells[z[inside][0], y[inside][0], x[inside][0]]) == (*FREE_COLOR, 40)
     grid = messages["/grid", "Grid"][-1][1]
     assert len(grid.data) == space.row_count * space.column_count * grid.cell_stride
-    assert (
-        grid.pose.position.z == pytest.approx(0, abs=0.05) != space.pose.position.z
-    )  # the ground, not the box
+    # At the ground, not at the bottom of the box.
+    assert grid.pose.position.z == pytest.approx(0, abs=0.05) != space.pose.position.z
 
 
 def test_rerun_reads_what_is_shown(recording, capsys):
