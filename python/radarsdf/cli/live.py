@@ -145,9 +145,8 @@ def live(given: Namespace, results: Results) -> None:
                 node = servers.enter_context(closing(Node(given.ros2_domain, given.host)))
                 scans = Subscription(node, given.ros2, request, given.find, stopped, warn)
                 sinks, unposed = [*sinks, Ros2Sink(node, scans)], scans.unposed
-                results.add(
-                    f"{', '.join(given.ros2)} mapped, the map published as /radarsdf/…; Ctrl-C ends it"
-                )
+                topics = ", ".join(given.ros2)
+                results.add(f"{topics} mapped, the map published as /radarsdf/…; Ctrl-C ends it")
             growing = (
                 LiveMap.load(begin, folder=folder)
                 if begin

@@ -139,7 +139,6 @@ class DistanceField:
 
     @cached_property
     def _padded(self) -> tuple[Floats32, Bools]:
-        """Return :attr:`surface_m`, extrapolated by a voxel, and :attr:`known`."""
         surface_m = np.minimum(self.surface_m, _FAR_M)
         return np.pad(surface_m, 1, mode="reflect", reflect_type="odd"), np.pad(self.known, 1)
 
