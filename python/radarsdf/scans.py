@@ -309,11 +309,11 @@ class Scans:
 
 def scans_in_memory(scans: Sequence[Scan]) -> Scans:
     """Collect scans, with the arrays that all of them have. Their poses are T_world_sensor."""
-    times_s = _all_or_none([scan.time_s for scan in scans])
+    times_s = all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
         times_s=None if times_s is None else np.array(times_s, np.float64),
-        sensors=_all_or_none([scan.sensor for scan in scans]),
+        sensors=all_or_none([scan.sensor for scan in scans]),
         **_arrays_of(scans),
     )
 
@@ -339,9 +339,9 @@ def chosen(arrays: Sequence[Any] | None, numbers: Ints | Sequence[int]) -> list[
 
 def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
     """Collect arrays by their names in :class:`Scans`: one per scan, or None where a scan has none."""
-    return {name: _all_or_none([getattr(scan, own) for scan in scans]) for name, own in _ARRAYS.items()}
+    return {name: all_or_none([getattr(scan, own) for scan in scans]) for name, own in _ARRAYS.items()}
 
 
-def _all_or_none(values: list[_Value | None]) -> list[_Value] | None:
+def all_or_none(values: list[_Value | None]) -> list[_Value] | None:
     given = [value for value in values if value is not None]
     return given if given and len(given) == len(values) else None

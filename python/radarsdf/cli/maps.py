@@ -27,12 +27,12 @@ from radarsdf.io.npz import arrays_of
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
-from radarsdf.map.view import View, scans_of_views
+from radarsdf.map.view import View
 from radarsdf.render import picture
 from radarsdf.render.figures import save_grid_picture, save_view_picture
 from radarsdf.report.writing import Subject, require_extras, write_changes_report, write_report
 from radarsdf.returns.moving import rays_as_measured
-from radarsdf.scans import Notes, Scans
+from radarsdf.scans import Notes, Scans, scans_in_memory
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import ChangesView, Viewer
 from radarsdf.view.serving import has_display, page_port, wait
@@ -116,11 +116,11 @@ def render(given: Namespace, results: Results) -> None:
     views: Iterable[View] = (radar_map.render(pose, **options) for pose in poses)
     if suffix == ".png":
         views = list(views)  # a picture shows the whole view; other formats need only the returns
-    scans = scans_of_views(view for view in views if len(view))
-    check(len(scans), f"{given.map} has no surface visible from there: nothing written")
+    seen = [view.scan for view in views if len(view)]
+    check(seen, f"{given.map} has no surface visible from there: nothing written")
     if suffix == ".png":
         save_view_picture(out, list(views))
-    add_scans(results, out, scans)
+    add_scans(results, out, scans_in_memory(seen))
 
 
 def _poses(words: list[str]) -> NDArray[np.float64]:
