@@ -54,19 +54,6 @@ class Scan:
         return np.asarray(self.points, np.float64) @ R.T + t
 
 
-def finite_returns(scan: Scan, notes: "Notes") -> Scan:
-    """Keep the returns with finite coordinates and intensity, and count the others."""
-    points, intensities = scan.points, scan.intensities
-    finite = np.isfinite(points).all(axis=1)
-    if intensities is not None:
-        finite &= np.isfinite(intensities)
-    if finite.all():
-        return scan
-    what = "returns left out: a coordinate or the intensity is not a finite number"
-    notes.count(what, int((~finite).sum()))
-    return with_returns(scan, np.asarray(finite))
-
-
 def with_returns(scan: Scan, kept: Bools) -> Scan:
     """Keep the returns in a mask (N,)."""
     arrays: dict[str, Any] = {name: getattr(scan, name) for name in _ARRAYS.values()}
