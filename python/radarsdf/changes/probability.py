@@ -18,7 +18,7 @@ from scipy.stats import t as student
 from radarsdf.arrays import Bools, Floats, Ints, Ints32
 from radarsdf.map.confidence import confidence, uncertainty
 from radarsdf.map.map import Map
-from radarsdf.map.threshold import across_triangles
+from radarsdf.map.mesh import across_triangles
 from radarsdf.products import transformed, turned
 from radarsdf.returns.view_statistics import PLACE_CELLS, ViewStatisticsAt, rows_of_views
 

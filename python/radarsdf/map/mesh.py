@@ -91,6 +91,13 @@ class Surface:
         return trimesh.Trimesh(vertices, faces, process=False, vertex_attributes=of_rows, metadata=metadata)
 
 
+def across_triangles(vertices: Floats, faces: Ints32) -> tuple[Floats, Floats]:
+    """Return the cross products (F, 3) of the edges of triangles (F, 3), and their lengths (F,), twice the areas, m²."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return across, np.sqrt(np.einsum("ni,ni->n", across, across))
+
+
 def with_all(good: Bools, faces: Ints32) -> Bools:
     """Return a mask (F,) of the faces (F, 3) with all vertices in the mask `good` (V,)."""
     first, second, third = faces.T

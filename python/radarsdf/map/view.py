@@ -11,8 +11,8 @@ from radarsdf.checks import check, flag, number, whole_number
 from radarsdf.core import SurfaceTracer, cell_keys
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, roughness
-from radarsdf.map.mesh import Surface
-from radarsdf.map.threshold import Limits, across_triangles
+from radarsdf.map.mesh import Surface, across_triangles
+from radarsdf.map.threshold import Limits
 from radarsdf.memory import check_views
 from radarsdf.products import turned
 from radarsdf.returns.sensor import Sensor
