@@ -42,12 +42,10 @@ def answers(scene, path, changes):
         fitted.save(path)
         for radar_map in (fitted, radarsdf.load(path)):
             x = scene.points[0][:50].astype(np.float64) @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
-            given = [radar_map.sdf(x), radar_map.gradient(x), radar_map.observed(x)]
-            given += [radar_map.confidence(x), radar_map.uncertainty(x)]
-            given += [
-                radar_map.sdf(torch.from_numpy(x)).numpy(),
-                radar_map.gradient(torch.from_numpy(x)).numpy(),
-            ]
+            names = "sdf", "gradient", "observed", "confidence", "uncertainty"
+            queries = [getattr(radar_map, name) for name in names]
+            given = [query(x) for query in queries]
+            given += [query(torch.from_numpy(x)).numpy() for query in queries[:2]]
             if intensities is not None:
                 given.append(radar_map.intensity(x, scene.poses[0, :3, 3]))
             mesh = radar_map.mesh(0.2, min_component_triangles=0, progress=False)

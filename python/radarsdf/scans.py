@@ -54,19 +54,6 @@ class Scan:
         return np.asarray(self.points, np.float64) @ R.T + t
 
 
-def finite_returns(scan: Scan, notes: "Notes") -> Scan:
-    """Keep the returns with finite coordinates and intensity, and count the others."""
-    points, intensities = scan.points, scan.intensities
-    finite = np.isfinite(points).all(axis=1)
-    if intensities is not None:
-        finite &= np.isfinite(intensities)
-    if finite.all():
-        return scan
-    what = "returns left out: a coordinate or the intensity is not a finite number"
-    notes.count(what, int((~finite).sum()))
-    return with_returns(scan, np.asarray(finite))
-
-
 def with_returns(scan: Scan, kept: Bools) -> Scan:
     """Keep the returns in a mask (N,)."""
     arrays: dict[str, Any] = {name: getattr(scan, name) for name in _ARRAYS.values()}
@@ -309,11 +296,11 @@ class Scans:
 
 def scans_in_memory(scans: Sequence[Scan]) -> Scans:
     """Collect scans, with the arrays that all of them have. Their poses are T_world_sensor."""
-    times_s = _all_or_none([scan.time_s for scan in scans])
+    times_s = all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
         times_s=None if times_s is None else np.array(times_s, np.float64),
-        sensors=_all_or_none([scan.sensor for scan in scans]),
+        sensors=all_or_none([scan.sensor for scan in scans]),
         **_arrays_of(scans),
     )
 
@@ -339,9 +326,9 @@ def chosen(arrays: Sequence[Any] | None, numbers: Ints | Sequence[int]) -> list[
 
 def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
     """Collect arrays by their names in :class:`Scans`: one per scan, or None where a scan has none."""
-    return {name: _all_or_none([getattr(scan, own) for scan in scans]) for name, own in _ARRAYS.items()}
+    return {name: all_or_none([getattr(scan, own) for scan in scans]) for name, own in _ARRAYS.items()}
 
 
-def _all_or_none(values: list[_Value | None]) -> list[_Value] | None:
+def all_or_none(values: list[_Value | None]) -> list[_Value] | None:
     given = [value for value in values if value is not None]
     return given if given and len(given) == len(values) else None

@@ -36,9 +36,8 @@ def peers(monkeypatch):
 def run(tmp_path, *words):
     runner.main("bench.paper", EXPERIMENTS, [*words, "--quick", "--out", str(tmp_path)])
     stem = tmp_path / f"paper-{words[0]}"
-    return stem.with_suffix(".md").read_text(encoding="utf-8"), json.loads(
-        stem.with_suffix(".json").read_text()
-    )
+    table = stem.with_suffix(".md").read_text(encoding="utf-8")
+    return table, json.loads(stem.with_suffix(".json").read_text())
 
 
 def shown(rows, **layout):
@@ -151,9 +150,8 @@ def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
     # Enough to differ.
     few = {"training": {"sdf_iterations": 3, "intensity_iterations": 3, "batch_size": 512}}
     monkeypatch.setattr("scenes.scene.QUICK", few)
-    neighbours, *ours = run(tmp_path, "intensity", "wall", "--base", "default", "--repetitions", "2")[1][
-        "rows"
-    ]
+    _, values = run(tmp_path, "intensity", "wall", "--base", "default", "--repetitions", "2")
+    neighbours, *ours = values["rows"]
     assert neighbours["method"] == "kNN"
     assert neighbours["noise_floor"] > 1
     assert ours[0]["mae"] != ours[1]["mae"]
@@ -163,10 +161,8 @@ def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
     # With and without direction, measured and noiseless, at the reflector and elsewhere.
     assert len(values["rows"]) == 8
     assert "### wall, at the reflector" in table
-    rows = run(tmp_path, "poses", "wall", "--repetitions", "1", "--frames", "6", "--samples", "3e3")[1][
-        "rows"
-    ]
-    assert {"none", "walk of 0.02 m, 0.1°", "returns alone"} <= {row["poses"] for row in rows}
+    _, values = run(tmp_path, "poses", "wall", "--repetitions", "1", "--frames", "6", "--samples", "3e3")
+    assert {"none", "walk of 0.02 m, 0.1°", "returns alone"} <= {row["poses"] for row in values["rows"]}
 
 
 @pytest.mark.usefixtures("peers")

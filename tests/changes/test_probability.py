@@ -88,9 +88,8 @@ def test_odds_of_distances_are_ratios_of_their_densities():
         scaled = student(3.0, scale=1.4 * sigmas[i])
 
         def mean_density(lower_m, d=distances[i], of=scaled):
-            return quad(lambda at: of.pdf(d - at), lower_m, 0.4, points=[max(d, lower_m)])[0] / (
-                0.4 - lower_m
-            )
+            found, _ = quad(lambda at: of.pdf(d - at), lower_m, 0.4, points=[max(d, lower_m)])
+            return found / (0.4 - lower_m)
 
         same = scaled.pdf(distances[i])
         assert absent[i] == pytest.approx(np.log(mean_density(0.0) / same), rel=1e-6)
@@ -152,9 +151,8 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
         found = _classify(of_side, odds, 0.5, lost)
         assert found.kind[0] == (lost if kind == GONE else kind)
         assert_allclose(found.moved_m[0], sign * distance_m if kind == MOVED else np.nan)
-        probable = (
-            shifted if kind == MOVED and distance_m < 0 else max(absent, shifted) if kind == MOVED else absent
-        )
+        of_moved = shifted if distance_m < 0 else max(absent, shifted)
+        probable = of_moved if kind == MOVED else absent
         assert found.probability[0] == pytest.approx(1 / (1 + np.exp(-probable)))
     # Surfaces of low probability have not changed.
     unsure = dataclasses.replace(

@@ -14,7 +14,9 @@ import radarsdf
 from radarsdf.cli.live import replay
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scan, Scans
-from radarsdf.view.sinks import FREE_COLOR, foxglove_sink, rerun_sink
+from radarsdf.view.foxglove import foxglove_sink
+from radarsdf.view.rerun import rerun_sink
+from radarsdf.view.sinks import FREE_COLOR
 
 from ..conftest import ground_and_wall
 from .calls import refusal, values
@@ -103,9 +105,8 @@ def test_mcap_readers_decode_what_is_shown(recording, capsys):
         assert [message.log_time for message, _ in messages[key]] == [round(1e8 * i) for i in range(6)]
     cloud = messages[one_each[2]][3][1]
     rows = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)
-    np.testing.assert_array_equal(
-        rows, np.column_stack([SCENE.points[3], SCENE.intensities[3]]).astype(np.float32)
-    )
+    expected = np.column_stack([SCENE.points[3], SCENE.intensities[3]]).astype(np.float32)
+    np.testing.assert_array_equal(rows, expected)
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "intensity"]
     assert messages[one_each[0]][3][1].translation.x == SCENE.poses[3, 0, 3]
     entity = messages["/surface", "SceneUpdate"][-1][1].entities[0]
@@ -118,19 +119,18 @@ def test_mcap_readers_decode_what_is_shown(recording, capsys):
     assert (vertices.max(axis=0) < mesh.bounds[1] + 1).all()
     assert [point.x for point in entity.lines[0].points] == SCENE.poses[:, 0, 3].tolist()
     space = messages["/free_space", "VoxelGrid"][-1][1]
-    cells = np.frombuffer(space.data, "u1").reshape(
-        -1, space.row_count, space.column_count, space.cell_stride
-    )
+    shape = -1, space.row_count, space.column_count, space.cell_stride
+    cells = np.frombuffer(space.data, "u1").reshape(shape)
     assert (space.slice_stride, space.row_stride) == cells.strides[:2]
     origin = np.array([getattr(space.pose.position, axis) for axis in "xyz"])
-    ahead = np.array(
-        [[12.0, 0.0, 1.0], [30.0, 0.0, 1.0], [14.0, 0.0, 0.01]]
-    )  # free, hidden by the wall, ground
+    ahead = np.array([[12.0, 0.0, 1.0], [30.0, 0.0, 1.0], [14.0, 0.0, 0.01]])  # free, behind the wall, ground
     x, y, z = np.floor((ahead - origin) / space.cell_size.x).astype(int).T
     inside = x < space.column_count
     assert tuple(cells[z[inside][0], y[inside][0], x[inside][0]]) == (*FREE_COLOR, 40)
     grid = messages["/grid", "Grid"][-1][1]
     assert len(grid.data) == space.row_count * space.column_count * grid.cell_stride
+    # At the ground, not at the bottom of the box.
+    assert grid.pose.position.z == pytest.approx(0, abs=0.05) != space.pose.position.z
 
 
 def test_rerun_reads_what_is_shown(recording, capsys):
@@ -181,8 +181,8 @@ def test_viewers_are_served_to_this_machine_only(open_sink, library):
             time.sleep(0.1)
         return {answers("127.0.0.1", port) for port in ports} == {wanted}
 
-    with open_sink(None) as (_, url):
-        ports = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", url)]
+    with open_sink(None) as sink:
+        ports = [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", sink.url)]
         assert len(ports) >= 1
         assert all_answer(ports, True)
         assert not any(answers("127.0.0.2", port) for port in ports)  # also this machine, on Linux
@@ -192,10 +192,10 @@ def test_viewers_are_served_to_this_machine_only(open_sink, library):
 def test_a_viewer_that_connects_later_sees_the_last_messages():
     pytest.importorskip("foxglove")
     connect = pytest.importorskip("websockets.sync.client").connect
-    with foxglove_sink(None) as (sink, url):
+    with foxglove_sink(None) as sink:
         for time_s in (1.0, 2.0):
             sink.show_scan(Scan(SCENE.points[0], SCENE.poses[0]), time_s)
-        with connect(url, subprotocols=["foxglove.sdk.v1"]) as server:
+        with connect(sink.url, subprotocols=["foxglove.sdk.v1"]) as server:
             advertised = next(said for said in map(json.loads, server) if said["op"] == "advertise")
             wanted = [{"id": one["id"], "channelId": one["id"]} for one in advertised["channels"]]
             server.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))

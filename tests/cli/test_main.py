@@ -27,15 +27,9 @@ print("imported:", *sorted({name.partition(".")[0] for name in set(sys.modules) 
 """
 
 
-def python(code, *words, **settings):
-    return subprocess.run(
-        [sys.executable, "-c", code, *words],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        **settings,
-    )
+def python(code, *words):
+    words = [sys.executable, "-c", code, *words]
+    return subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
 
 
 def test_the_overview_lists_every_command_and_imports_nothing():
@@ -125,13 +119,8 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
 def test_a_broken_pipe_is_no_error():
     read, write = os.pipe()
     os.close(read)
-    done = subprocess.run(
-        [sys.executable, "-m", "radarsdf", "config"],
-        stdout=write,
-        stderr=subprocess.PIPE,
-        timeout=60,
-        check=False,
-    )
+    words = [sys.executable, "-m", "radarsdf", "config"]
+    done = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, timeout=60, check=False)
     os.close(write)
     assert done.stderr == b""
 
@@ -157,15 +146,10 @@ def config(*words):
 def test_settings_override_a_file_and_a_file_a_preset(tmp_path):
     path = tmp_path / "settings.toml"
     path.write_text("seed = 3\n[training]\nsdf_iterations = 7\nbatch_size = 64\n")
-    changes = [
-        "training.batch_size=32",
-        "encoding.kind=octree",
-        "returns.max_range_m=None",
-        "networks.normals=true",
-    ]
+    changes = "training.batch_size=32 encoding.kind=octree returns.max_range_m=None networks.normals=true"
     assert config() == FitConfig()
     assert config("--paper") == FitConfig.paper()
-    words = [word for change in changes for word in ("--set", change)]
+    words = [word for change in changes.split() for word in ("--set", change)]
     assert config("--quick", "--config", path, *words) == FitConfig.quick(
         seed=3,
         training={"sdf_iterations": 7, "batch_size": 32},

@@ -52,13 +52,8 @@ def test_it_serves_until_ctrl_c(map_file, scans_file):
     pytest.importorskip("viser", reason="the extra view is not installed")
     words = ["view", map_file, scans_file, "--voxel", "0.3", "--port", "0", "--quiet"]
     hidden = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "radarsdf", *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=hidden,
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-m", "radarsdf", *words], env=hidden, **pipes)
     try:
         port = int(re.search(r"http://localhost:(\d+); Ctrl-C ends it", process.stdout.readline())[1])
         with urllib.request.urlopen(f"http://127.0.0.1:{port}") as page:

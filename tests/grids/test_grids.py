@@ -27,9 +27,7 @@ def test_surfaces_are_occupied_air_is_free_and_hidden_space_is_unknown(grid):
     assert (grid.at(ground) == 0).mean() < 0.001
     # The ground is the border of two voxels.
     assert np.any([grid.at(ground + [0, 0, z]) == 1 for z in (-0.01, 0.01)], axis=0).mean() > 0.9
-    air = np.column_stack(
-        [rng.uniform(8, 16, 2000), rng.uniform(-1.5, 1.5, 2000), rng.uniform(0.8, 1.3, 2000)]
-    )
+    air = rng.uniform([8, -1.5, 0.8], [16, 1.5, 1.3], (2000, 3))
     assert (grid.at(air) == 0).mean() > 0.7
     below, behind = ground - [0, 0, 0.8], np.column_stack([np.full(2000, 21.2), ground[:, 1], air[:, 2]])
     assert (grid.at(np.concatenate([below, behind])) == -1).all()
@@ -193,10 +191,7 @@ def test_interpolated_distances_and_gradients_of_a_plane():
 
 def test_obstacles_count_as_surface_where_the_map_has_none():
     grid, _ = sloped()
-    boxes = [
-        [[1.03, 1.1, 3.05], [1.62, 2.0, 9.0]],
-        [[9, 9, 9], [10, 10, 10]],
-    ]  # one of them reaches out, one is outside
+    boxes = [[[1.03, 1.1, 3.05], [1.62, 2.0, 9.0]], [[9, 9, 9], [10, 10, 10]]]  # reaches out, is outside
     field = grid.distances(boxes)
     x = np.array([[0.65, 1.5, 3.6], [1.3, 1.5, 3.6], [2.1, 1.5, 3.6]])
     distance_m, gradient = field.at(x)

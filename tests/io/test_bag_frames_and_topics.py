@@ -152,9 +152,8 @@ def test_topics_without_a_frame_have_poses_of_the_base(tmp_path, which):
 
 @pytest.mark.parametrize("other", ["as good", "constant", "short"])
 def test_the_parent_frame_with_poses_is_used(tmp_path, other):
-    times_s = {"as good": TIMES_S, "constant": TIMES_S.repeat(3), "short": START_S + np.arange(50) * 0.002}[
-        other
-    ]
+    short_s = START_S + np.arange(50) * 0.002
+    times_s = {"as good": TIMES_S, "constant": TIMES_S.repeat(3), "short": short_s}[other]
 
     def second(bag):
         for time_s in times_s:

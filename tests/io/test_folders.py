@@ -30,13 +30,11 @@ def write_pcd(path, columns, data="binary", **header):
         "POINTS": str(count),
         "DATA": data,
     } | header
-    text = "# .PCD v0.7 - Point Cloud Data file format\n" + "".join(
-        f"{k} {v}\n" for k, v in lines.items() if v is not None
-    )
+    written = (f"{k} {v}\n" for k, v in lines.items() if v is not None)
+    text = "".join(["# .PCD v0.7 - Point Cloud Data file format\n", *written])
     if data == "ascii":
-        body = "".join(
-            " ".join(repr(x.item()) for x in row) + "\n" for row in zip(*arrays, strict=True)
-        ).encode()
+        rows = (" ".join(repr(x.item()) for x in row) for row in zip(*arrays, strict=True))
+        body = "".join(f"{row}\n" for row in rows).encode()
     else:
         record = np.zeros(count, [(f"f{i}", a.dtype.newbyteorder("<")) for i, a in enumerate(arrays)])
         for i, a in enumerate(arrays):
@@ -68,9 +66,8 @@ def stamp(time_s):
 def posed(tmp_path):
     """Three scans; the base moves 1 m along x and turns left by 90 degrees in 0.4 s."""
     folder = tmp_path / "viking"
-    write_pcd(
-        folder / "radar" / stamp(0.0), radar_cloud([[1, 2, 3], [4, 5, 6]], doppler=[0, 0], power=[70, 80])
-    )
+    first = radar_cloud([[1, 2, 3], [4, 5, 6]], doppler=[0, 0], power=[70, 80])
+    write_pcd(folder / "radar" / stamp(0.0), first)
     write_pcd(folder / "radar" / stamp(0.2), radar_cloud([[7, 8, 9]], doppler=[0], power=[90]))
     write_pcd(folder / "radar" / stamp(0.4), radar_cloud([[3, 2, 1]], doppler=[0], power=[75.5]))
     write_poses(folder / "poses.txt", [(0.0, (10, 0, 1), STRAIGHT), (0.4, (11, 0, 1), TURN_LEFT)])
@@ -106,9 +103,8 @@ def snail(tmp_path):
     folder = tmp_path / "data3"
     clouds = folder / "eagleg7" / "enhanced"
     write_pcd(clouds / stamp(0.0), radar_cloud([[5, 0, 0]], Doppler=[1], Range=[5], Power=[12.5]))
-    write_pcd(
-        clouds / stamp(0.2), radar_cloud([[6, 0, 0], [0, 7, 0]], Doppler=[1, 2], Range=[6, 7], Power=[1, 2])
-    )
+    second = radar_cloud([[6, 0, 0], [0, 7, 0]], Doppler=[1, 2], Range=[6, 7], Power=[1, 2])
+    write_pcd(clouds / stamp(0.2), second)
     (clouds / "times.txt").write_text("0\n")
     # Left, back, up are west, south, up: half a turn about z.
     facing_north = (0, 0, 1, 0)

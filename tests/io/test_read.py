@@ -19,9 +19,8 @@ def clouds(folder, count=11, name="scan_{}.pcd"):
     """Scan i holds i + 1 returns at x = i, with Power and Doppler."""
     for i in range(count):
         xyz = np.column_stack([np.full(i + 1, i), np.arange(i + 1), np.ones(i + 1)])
-        write_pcd(
-            folder / name.format(i), radar_cloud(xyz, Doppler=np.full(i + 1, -i), Power=np.arange(i + 1))
-        )
+        cloud = radar_cloud(xyz, Doppler=np.full(i + 1, -i), Power=np.arange(i + 1))
+        write_pcd(folder / name.format(i), cloud)
     return folder
 
 
@@ -215,11 +214,8 @@ def test_radars_and_mountings_are_kept(tmp_path, mounted):
     points = [np.full((2, 3), i + 1.0) for i in range(3)]
     scans = Scans(points, POSES[:3], sensors=labels, T_body_sensor=mountings)
     write_scans(tmp_path / "rig.npz", scans)
-    for again in (
-        read_scans(tmp_path / "rig.npz"),
-        read(tmp_path / "rig.npz"),
-        read(tmp_path / "rig.npz", POSES[:3]),
-    ):
+    path = tmp_path / "rig.npz"
+    for again in (read_scans(path), read(path), read(path, POSES[:3])):
         assert (again.sensors, [scan.sensor for scan in again]) == (labels, labels)
         assert_allclose(again.poses, POSES[:3], atol=1e-12)
         assert_allclose(again.sensor_poses, scans.sensor_poses, atol=1e-12)
@@ -227,9 +223,8 @@ def test_radars_and_mountings_are_kept(tmp_path, mounted):
     write_poses(tmp_path / "body.tum", POSES[:3], np.arange(3.0))
     timed = Scans(points, POSES[:3], times_s=np.arange(3.0), sensors=labels, T_body_sensor=mountings)
     write_scans(tmp_path / "rig.npz", timed)
-    assert_allclose(
-        read(tmp_path / "rig.npz", tmp_path / "body.tum").sensor_poses, scans.sensor_poses, atol=1e-6
-    )
+    again = read(tmp_path / "rig.npz", tmp_path / "body.tum")
+    assert_allclose(again.sensor_poses, scans.sensor_poses, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -75,9 +75,8 @@ def test_any_voxel_size_gives_the_same_surface(sharp_map, mesh_of, voxel_size):
     assert 95 < projected < 125
     # At most a voxel outside the observed space.
     cells = sharp_map.field.table.leaf_cells()
-    lower, upper = (
-        corner * LEAF_M + sharp_map.origin for corner in (cells.min(axis=0), cells.max(axis=0) + 1)
-    )
+    ends = np.stack([cells.min(axis=0), cells.max(axis=0) + 1])
+    lower, upper = ends * LEAF_M + sharp_map.origin
     nearest = np.clip(mesh.vertices, lower, upper)
     assert np.abs(mesh.vertices - nearest).max() <= voxel_size + 1e-6
 
@@ -134,9 +133,8 @@ def test_a_viewpoint_gives_intensities_and_colours(sharp_map, mesh):
     intensity = seen.vertex_attributes["intensity"]
     np.testing.assert_allclose(intensity, sharp_map.intensity(np.asarray(seen.vertices), SENSOR), atol=1e-4)
     scale = sharp_map.intensity_scale
-    np.testing.assert_array_equal(
-        seen.visual.vertex_colors, intensity_colors(intensity, scale.low, scale.high)
-    )
+    expected = intensity_colors(intensity, scale.low, scale.high)
+    np.testing.assert_array_equal(seen.visual.vertex_colors, expected)
     x, _, z = seen.vertices.T
     on_wall = (np.abs(x - 20) < 0.1) & (z > 1) & (z < 3)
     expected = 100 - 40 * np.log10(np.linalg.norm(seen.vertices[on_wall] - SENSOR, axis=1))

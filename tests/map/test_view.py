@@ -91,9 +91,8 @@ def test_density_of_returns_on_surfaces(roughness):
         patch.setattr(views, "_spread", spread)
         rows = _patches(viewed, np.eye(3), position, SENSOR, 10)
     np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(seen))
-    of_rate, of_cosine, of_range, hidden = (1 - roughness) * np.array([1, 1, 2, 0.01]) + roughness * np.array(
-        [2.2, 0.3, 1, 0.65]
-    )
+    smooth, rough = np.array([[1, 1, 2, 0.01], [2.2, 0.3, 1, 0.65]])
+    of_rate, of_cosine, of_range, hidden = (1 - roughness) * smooth + roughness * rough
     density = area_m2 * rates**of_rate / ranges_m**of_range
     density *= np.where(kinds == 3, 0.5, 1.0) ** of_cosine * np.where(kinds == 4, hidden, 1.0)
     np.testing.assert_allclose(found["expected"], density[rows], rtol=1e-6)
@@ -133,17 +132,15 @@ def test_beams_meet_the_first_surface(view):
 
 
 def test_a_given_sensor_decides(sharp_map):
-    narrow = dataclasses.replace(
-        sharp_map.sensor, azimuth_rad=(-0.1, 0.1), range_m=(1.0, 15.0), returns_per_scan=50
-    )
+    limits = {"azimuth_rad": (-0.1, 0.1), "range_m": (1.0, 15.0), "returns_per_scan": 50}
+    narrow = dataclasses.replace(sharp_map.sensor, **limits)
     view = sharp_map.render(POSE, narrow)
     assert 0 < len(view) <= 50
     assert np.abs(np.arctan2(view.points[:, 1], view.points[:, 0])).max() <= 0.1 + 1e-6
     assert view.ranges_m.max() <= 15.0 + 1e-3
     deaf = dataclasses.replace(sharp_map.sensor, thresholds=((1.0, 1e6),))
-    assert len(sharp_map.render(POSE, deaf)) == (
-        0 if sharp_map.has_intensity else len(sharp_map.render(POSE))
-    )
+    heard = 0 if sharp_map.has_intensity else len(sharp_map.render(POSE))
+    assert len(sharp_map.render(POSE, deaf)) == heard
 
 
 def test_missing_memory_is_reported_before_the_work(sharp_map, monkeypatch):

@@ -61,9 +61,8 @@ def test_the_nearer_surface_hides_the_farther():
     a.apply_transform(trimesh.transformations.rotation_matrix(0.5, [0, 0, 1]))
     b.apply_transform(trimesh.transformations.rotation_matrix(-0.5, [0, 0, 1]))
     colors = np.vstack([one_color(a, (0, 200, 0)), one_color(b, (200, 0, 0))])
-    image = render(
-        trimesh.util.concatenate([a, b]), colors, width=200, height=200, viewpoint=(0, -9, 0)
-    ).astype(int)
+    walls = trimesh.util.concatenate([a, b])
+    image = render(walls, colors, width=200, height=200, viewpoint=(0, -9, 0)).astype(int)
     assert image[100, 60, 1] > image[100, 60, 0]
     assert image[100, 140, 0] > image[100, 140, 1]
 

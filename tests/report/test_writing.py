@@ -179,9 +179,8 @@ def test_a_browser_shows_the_report_offline(written):
             page.tab.set_viewport_size({"width": width, "height": 700})
             page.tab.reload()  # the scene is framed for the width at which it is loaded
             canvas = page.tab.frame_locator("iframe").locator("canvas").first
-            page.tab.locator(
-                "iframe"
-            ).scroll_into_view_if_needed()  # frames outside of the view are not drawn
+            # Frames outside of the view are not drawn.
+            page.tab.locator("iframe").scroll_into_view_if_needed()
             canvas.wait_for(state="visible")
             page.wait_until(lambda: drawn(page.screenshot_of("iframe")) > 2_000)
             box = canvas.bounding_box()

@@ -42,9 +42,8 @@ def test_scans_of_all_radars_are_in_order_of_time(drive, rig):
 
 def test_doppler_includes_the_lever_arm(drive):
     times_s, body = 0.1 * np.arange(9), np.tile(np.eye(4), (9, 1, 1))
-    body[:, :3, :3] = Rotation.from_euler(
-        "z", times_s[:, None]
-    ).as_matrix()  # a circle of 3 m radius at 1 rad/s
+    # A circle of 3 m radius at 1 rad/s.
+    body[:, :3, :3] = Rotation.from_euler("z", times_s[:, None]).as_matrix()
     body[:, :3, 3] = 3.0 * np.stack([np.sin(times_s), 1 - np.cos(times_s), 0.5 + 0 * times_s], axis=1)
     rig = sim.simulate_rig(drive.scene, three_radars(drive.sensor), body, times_s)
     for label, one in rig.radars.items():

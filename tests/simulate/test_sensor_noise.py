@@ -45,9 +45,8 @@ def test_side_lobes_keep_range_and_azimuth_and_add_returns():
     false = scan.origin_kind == sim.Origin.SIDELOBE
     assert false.sum() / len(clean.points) == pytest.approx(0.2, abs=0.03)
     assert np.isnan(scan.noiseless_intensities[false]).all()
-    np.testing.assert_array_equal(
-        *(np.sort(points, axis=0) for points in (scan.points[~false], clean.points))
-    )
+    left, expected = (np.sort(points, axis=0) for points in (scan.points[~false], clean.points))
+    np.testing.assert_array_equal(left, expected)
     points = scan.points[false].astype(np.float64)
     ranges_m = np.linalg.norm(points, axis=1)
     elevation = np.arcsin(points[:, 2] / ranges_m)
@@ -70,9 +69,8 @@ def test_clutter_follows_its_shares():
         return scan.points[false].astype(np.float64), scan.intensities[false]
 
     near, power_db = clutter(clutter_near_share=1.0)
-    assert np.median(np.linalg.norm(near, axis=1)) == pytest.approx(
-        sensor.min_range_m + 1.5 * np.log(2), abs=0.1
-    )
+    median_m = sensor.min_range_m + 1.5 * np.log(2)
+    assert np.median(np.linalg.norm(near, axis=1)) == pytest.approx(median_m, abs=0.1)
     assert np.mean(power_db - 40.0) == pytest.approx(6.0, rel=0.1)
     before, _ = clutter(clutter_near_share=0.0)
     assert (before[:, 0] < 0.96 * distance_m).all()
@@ -145,12 +143,9 @@ def test_an_imu_measures_in_its_own_axes_at_its_lever_arm(circle):
     rate, force = R_world_imu.T @ [0, 0, 1], R_world_imu.T @ (-position * [1, 1, 0] + [0, 0, 9.81])
     # The mean over 50 ms, in which the vectors hardly change in the axes of the IMU.
     near = slice(975, 1026)
-    np.testing.assert_allclose(
-        imu.angular_velocity[near].mean(axis=0), rate + BIAS_RAD_S, atol=4 * 0.005 / 50**0.5
-    )
-    np.testing.assert_allclose(
-        imu.specific_force[near].mean(axis=0), force + BIAS_MPS2, atol=4 * 0.05 / 50**0.5
-    )
+    rates, forces = (values[near].mean(axis=0) for values in (imu.angular_velocity, imu.specific_force))
+    np.testing.assert_allclose(rates, rate + BIAS_RAD_S, atol=4 * 0.005 / 50**0.5)
+    np.testing.assert_allclose(forces, force + BIAS_MPS2, atol=4 * 0.05 / 50**0.5)
     middle = slice(200, 1800)  # splines oscillate at their ends
     np.testing.assert_allclose(imu.angular_velocity[middle].std(axis=0), 0.005, rtol=0.1)
     np.testing.assert_allclose(imu.specific_force[middle].std(axis=0), 0.05, rtol=0.1)

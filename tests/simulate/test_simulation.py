@@ -54,9 +54,8 @@ def test_hits_are_the_first_points_on_the_surface(mixed_scene):
     points = origin + hits.range_m[seen, None] * directions[seen]
     assert np.abs(mixed_scene.signed_distance(points)).max() < 1e-7
     # A millimetre-high crest of the ground may be skipped, a solid may not.
-    before = (
-        origin + (rng.uniform(0, 0.999, size=seen.sum()) * hits.range_m[seen])[:, None] * directions[seen]
-    )
+    before_m = rng.uniform(0, 0.999, size=seen.sum()) * hits.range_m[seen]
+    before = origin + before_m[:, None] * directions[seen]
     assert mixed_scene.signed_distance(before).min() > -5e-3
 
 
@@ -133,9 +132,7 @@ SUMMARIES = {
 
 def summary(one):
     """Means of bounding spheres, distances and reflectivities; returns by origin, their mean, intensities, lidar points."""
-    spheres = [
-        (*center, radius) for center, radius in (solid.bounding_sphere() for solid in one.scene.solids)
-    ]
+    spheres = [np.append(*solid.bounding_sphere()) for solid in one.scene.solids]
     probe = np.random.default_rng(0).uniform([-20, -20, -1], [60, 20, 6], size=(300, 3))
     intensities, noiseless = (np.concatenate(v) for v in (one.intensities, one.noiseless_intensities))
     return (
@@ -150,9 +147,8 @@ def summary(one):
 def test_simulations_are_deterministic_by_seed(name):
     one, again = (sim.SCENES[name](seed=3, frames=2) for _ in range(2))
     other = sim.SCENES[name](seed=4, frames=1)
-    for value, expected, atol in zip(
-        summary(one), SUMMARIES[name], [1e-3, 1e-3, 1e-3, 2, 0.02, 0.02, 0.02, 3], strict=True
-    ):
+    tolerances = 1e-3, 1e-3, 1e-3, 2, 0.02, 0.02, 0.02, 3
+    for value, expected, atol in zip(summary(one), SUMMARIES[name], tolerances, strict=True):
         np.testing.assert_allclose(value, expected, rtol=0, atol=atol)
     for field in ("points", "intensities", "noiseless_intensities", "origin_kind"):
         for a, b in zip(getattr(one, field), getattr(again, field), strict=True):

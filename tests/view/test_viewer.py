@@ -131,9 +131,8 @@ def test_a_scan_is_shown_and_the_sensor_moves_there(client, viewer, scans, sharp
     client.wait_for(is_mesh, before)  # coloured for that position
     text = client.wait_for(lambda m: "scan 4: " in str(m.message.get("updates", {}).get("_markdown")), before)
     view = sharp_map.render(scans.poses[4])
-    assert f"{len(scans.points[4])} returns measured, {len(view)} predicted; median error" in str(
-        text.message
-    )
+    described = f"{len(scans.points[4])} returns measured, {len(view)} predicted; median error"
+    assert described in str(text.message)
     shown = viewer._clouds.nodes["predicted"].points
     np.testing.assert_allclose(shown, view.world_points - sharp_map.origin, atol=1e-4)
     before = len(client.received())
@@ -262,8 +261,6 @@ def test_a_map_far_away_without_intensities():
         assert "intensity" not in content(answer)
         with pytest.raises(OSError, match="in use"):
             Viewer(radar_map, port=viewer.port)
-    assert "radarsdf view" not in [
-        thread.name for thread in threading.enumerate() if thread is viewer._painter._thread
-    ]
+    assert viewer._painter._thread not in threading.enumerate()
     with Viewer(radar_map, voxel_size=0.3, port=viewer.port, progress=False):  # the port is free again
         pass

@@ -9,7 +9,7 @@ from scipy.stats import chi2, qmc
 from radarsdf.arrays import Floats, Ints
 from radarsdf.changes.probability import PARALLEL, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.core import LocalPlanes
-from radarsdf.map.threshold import across_triangles
+from radarsdf.map.mesh import across_triangles
 from radarsdf.poses.agreement import Verdict
 from radarsdf.poses.rigid import moved, rotation_vector, skew
 from radarsdf.poses.search import Lost, OrientedPoints, SurfaceIndex, search

@@ -17,8 +17,7 @@ from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_free_space
 from radarsdf.io.meshes import write_mesh
 from radarsdf.map.map import Map
-from radarsdf.map.mesh import renumbered
-from radarsdf.map.threshold import across_triangles
+from radarsdf.map.mesh import across_triangles, renumbered
 from radarsdf.products import transformed
 from radarsdf.scans import Scans
 

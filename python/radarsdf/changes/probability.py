@@ -18,9 +18,9 @@ from scipy.stats import t as student
 from radarsdf.arrays import Bools, Floats, Ints, Ints32
 from radarsdf.map.confidence import confidence, uncertainty
 from radarsdf.map.map import Map
-from radarsdf.map.threshold import across_triangles
+from radarsdf.map.mesh import across_triangles
 from radarsdf.products import transformed, turned
-from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
+from radarsdf.returns.view_statistics import PLACE_CELLS, ViewStatisticsAt, rows_of_views
 
 # Reach of distances around the surface of a field: returns scatter into the next cells.
 _REACH_CELLS = 2.0
@@ -109,7 +109,6 @@ class PlacedMap:
         return PlaceEvidence(distance_m, normals, uncertainty_m, probability, hits, passes)
 
     def _passes(self, own: Floats) -> Floats:
-        """(N,) :attr:`PlaceEvidence.passes` of places (N, 3), world of the map, m."""
         found = np.zeros(len(own))
         blocks = np.unique(np.floor(own / _BLOCK_M), axis=0, return_inverse=True)[1].ravel()
         edges = np.cumsum(np.bincount(blocks))[:-1]
@@ -302,19 +301,17 @@ class Differences:
         if None in scales or not all(len(day.counts) for day in days):
             return "Reflectance was not compared: a map has no intensities."
         leaf_m = max(before.leaf_m, after.leaf_m)
-        points, directions, ranges_m, counts, intensities = (
-            np.concatenate([getattr(day, name) for day in days])
-            for name in ("points", "directions", "ranges_m", "counts", "intensities")
-        )
+        both = ViewStatisticsAt.together(days)
+        points, directions, ranges_m = both.points, both.directions, both.ranges_m
         sensors = points - directions * ranges_m[:, None]
         expected = [p.radar_map.intensity(p.to_own(points), p.to_own(sensors)) for p in (before, after)]
-        left = intensities - np.mean(expected, axis=0)
+        left = both.intensities - np.mean(expected, axis=0)
         of_day = np.repeat([0, 1], [len(day.counts) for day in days])
         views, count = rows_of_views(points - points.mean(axis=0), directions, ranges_m, leaf_m)
         known = np.isfinite(left)
         row = (of_day * count + views)[known]
-        columns = np.column_stack([np.ones(len(left)), left, intensities, points])[known]
-        sums = np.stack([np.bincount(row, counts[known] * column, 2 * count) for column in columns.T])
+        columns = np.column_stack([np.ones(len(left)), left, both.intensities, points])[known]
+        sums = np.stack([np.bincount(row, both.counts[known] * column, 2 * count) for column in columns.T])
         sums = sums.reshape(len(sums), 2, count)  # by day and view
         first, second = sums[:, :, (sums[0] > 0).all(axis=0)].transpose(1, 0, 2)
         if first.size == 0:

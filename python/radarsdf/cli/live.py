@@ -27,9 +27,12 @@ from radarsdf.live.store import ScanId
 from radarsdf.poses.search import Lost
 from radarsdf.rig import Label
 from radarsdf.scans import Scan, Scans
+from radarsdf.view.foxglove import foxglove_sink
 from radarsdf.view.pages import GrowingView
-from radarsdf.view.serving import WAIT_STEP_S, url_of, wait
-from radarsdf.view.sinks import Ros2Sink, Sink, foxglove_sink, rerun_sink
+from radarsdf.view.rerun import rerun_sink
+from radarsdf.view.ros2 import Ros2Sink
+from radarsdf.view.serving import WAIT_STEP_S, wait
+from radarsdf.view.sinks import Sink
 
 _SHOWN_EVERY_S = 0.5
 _GRID_SHARE = 0.05  # share of the time spent on free space, for which a map is fitted anew
@@ -120,7 +123,8 @@ def live(given: Namespace, results: Results) -> None:
     checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
     check_outputs([out, trajectory, given.mcap, given.rrd], inputs_of(given))
     with ExitStack() as servers, ExitStack() as files:
-        sinks, urls = _opened_sinks(given, servers, files)
+        sinks = _opened_sinks(given, servers, files)
+        urls = [sink.url for sink in sinks if sink.url]
         begin = given.map
         changed = begin and (given.config or given.set or given.paper)
         refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
@@ -141,9 +145,8 @@ def live(given: Namespace, results: Results) -> None:
                 node = servers.enter_context(closing(Node(given.ros2_domain, given.host)))
                 scans = Subscription(node, given.ros2, request, given.find, stopped, warn)
                 sinks, unposed = [*sinks, Ros2Sink(node, scans)], scans.unposed
-                results.add(
-                    f"{', '.join(given.ros2)} mapped, the map published as /radarsdf/…; Ctrl-C ends it"
-                )
+                topics = ", ".join(given.ros2)
+                results.add(f"{topics} mapped, the map published as /radarsdf/…; Ctrl-C ends it")
             growing = (
                 LiveMap.load(begin, folder=folder)
                 if begin
@@ -177,19 +180,17 @@ def _close_and_save(given: Namespace, results: Results, live_map: LiveMap, integ
         results.add(f"trajectory {given.trajectory}", trajectory=given.trajectory)
 
 
-def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> tuple[list[Sink], list[str]]:
-    """Sinks of the options, and the addresses of those that serve."""
-    opened: list[tuple[Sink, str]] = []
+def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> list[Sink]:
+    opened: list[Sink] = []
     if given.view:
-        page = servers.enter_context(GrowingView(host=given.host, port=given.port))
-        opened.append((page, url_of(page.host, page.port)))
+        opened.append(servers.enter_context(GrowingView(host=given.host, port=given.port)))
     of_viewers = (foxglove_sink, given.foxglove, given.mcap), (rerun_sink, given.rerun, given.rrd)
     for open_sink, served, path in of_viewers:
         if served:
             opened.append(servers.enter_context(open_sink(None)))
         if path is not None:
             opened.append(files.enter_context(open_sink(path)))
-    return [sink for sink, _ in opened], [url for _, url in opened if url]
+    return opened
 
 
 class _Shown:

@@ -27,15 +27,15 @@ from radarsdf.io.npz import arrays_of
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
-from radarsdf.map.view import View, scans_of_views
+from radarsdf.map.view import View
 from radarsdf.render import picture
 from radarsdf.render.figures import save_grid_picture, save_view_picture
 from radarsdf.report.writing import Subject, require_extras, write_changes_report, write_report
 from radarsdf.returns.moving import rays_as_measured
-from radarsdf.scans import Notes, Scans
+from radarsdf.scans import Notes, Scans, scans_in_memory
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.pages import ChangesView, Viewer
-from radarsdf.view.serving import has_display, page_port, url_of, wait
+from radarsdf.view.serving import has_display, page_port, wait
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
@@ -116,11 +116,11 @@ def render(given: Namespace, results: Results) -> None:
     views: Iterable[View] = (radar_map.render(pose, **options) for pose in poses)
     if suffix == ".png":
         views = list(views)  # a picture shows the whole view; other formats need only the returns
-    scans = scans_of_views(view for view in views if len(view))
-    check(len(scans), f"{given.map} has no surface visible from there: nothing written")
+    seen = [view.scan for view in views if len(view)]
+    check(seen, f"{given.map} has no surface visible from there: nothing written")
     if suffix == ".png":
         save_view_picture(out, list(views))
-    add_scans(results, out, scans)
+    add_scans(results, out, scans_in_memory(seen))
 
 
 def _poses(words: list[str]) -> NDArray[np.float64]:
@@ -143,10 +143,9 @@ def view(given: Namespace, results: Results) -> None:
     options = {"box": given.box, "progress": results.progress, "explained": explained}
     page = {"voxel_size": given.voxel, "host": given.host, "port": given.port}
     with Viewer(radar_map, scans, **page, **options, **mesh_limits(given)) as viewer, results.until_stopped():
-        url = url_of(viewer.host, viewer.port)
-        results.say(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it")
+        results.say(f"{len(viewer.surface.vertices)} vertices on {viewer.url}; Ctrl-C ends it")
         if has_display() if given.open is None else given.open:
-            webbrowser.open(url)
+            webbrowser.open(viewer.url)
         viewer.wait()
 
 
@@ -218,7 +217,7 @@ def compare(given: Namespace, results: Results) -> None:
     if given.view:
         page = ChangesView(changes, regions, edge_m, host=given.host, port=given.port)
         with page, results.until_stopped():
-            results.say(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it")
+            results.say(f"changes on {page.url}; Ctrl-C ends it")
             wait()
 
 

@@ -249,7 +249,6 @@ def to_toml(config: FitConfig) -> str:
 
 
 def _toml_lines(group: Any) -> list[str]:
-    """Return the lines of the settings of a group, then those of the groups in it."""
     lines, tables = list[str](), list[str]()
     for name, field in group.__pydantic_fields__.items():
         value, text = getattr(group, name), " ".join((field.description or "").split())

@@ -67,7 +67,6 @@ class Field(nn.Module, ABC):
         return True
 
     def _closed_form(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
-        """Return the contribution (N,) of :attr:`reflectance` to the intensity."""
         if self.reflectance is None:
             return torch.zeros_like(ranges_m)
         return torch.from_numpy(self.reflectance.at(points.numpy(), directions.numpy(), ranges_m.numpy(), 1))

@@ -68,6 +68,8 @@ class FlatGrid:
     """Edge of a column, m."""
     state: NDArray[np.int8]
     """(X, Y) -1: unknown, 0: free, 1: occupied."""
+    ground_m: float
+    """Median height of the ground, world, m."""
 
     def save(self, path: AnyPath) -> None:
         """Write the grid in the format of ROS's map_server: ``NAME.yaml``, which is `path`, and the image ``NAME.pgm``.
@@ -137,7 +139,6 @@ class DistanceField:
 
     @cached_property
     def _padded(self) -> tuple[Floats32, Bools]:
-        """Return :attr:`surface_m`, extrapolated by a voxel, and :attr:`known`."""
         surface_m = np.minimum(self.surface_m, _FAR_M)
         return np.pad(surface_m, 1, mode="reflect", reflect_type="odd"), np.pad(self.known, 1)
 
@@ -304,7 +305,7 @@ class Grid:
         free &= base + upper_m <= top_m + half
         state = np.full(height.shape, UNKNOWN, np.int8)
         state[free], state[(self.occupied & between).any(axis=2)] = FREE, OCCUPIED
-        return FlatGrid(self.origin[:2].copy(), self.voxel_size, state)
+        return FlatGrid(self.origin[:2].copy(), self.voxel_size, state, float(np.nanmedian(height)))
 
     def save(self, path: AnyPath) -> None:
         """Write the grid to a file. An existing one is replaced only once the new one is complete.

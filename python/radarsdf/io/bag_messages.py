@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import cache, partial
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -135,9 +135,8 @@ def _point_cloud(message: Any) -> Columns:
 
 def _columns(names: Iterable[str], rows: list[Any]) -> Columns:
     """Columns of the attributes of rows. The name of an angle ends in its unit, which that of its attribute lacks."""
-    return {
-        name: np.array([getattr(r, name.removesuffix("_rad")) for r in rows], np.float32) for name in names
-    }
+    attributes = {name: attrgetter(name.removesuffix("_rad")) for name in names}
+    return {name: np.array([*map(of, rows)], np.float32) for name, of in attributes.items()}
 
 
 def _ars548_packets(message: Any) -> Columns:

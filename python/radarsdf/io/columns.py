@@ -15,7 +15,7 @@ from scipy import constants
 from radarsdf.arrays import Array, Floats
 from radarsdf.checks import check
 from radarsdf.io.files import reading
-from radarsdf.scans import Columns, Notes, Scan, finite_returns
+from radarsdf.scans import Columns, Notes, Scan, with_returns
 
 _COMMENT = re.compile("(#|//|%).*")
 _SINCE_1970 = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
@@ -311,7 +311,7 @@ class Fields:
             notes.add(f"unused fields: {', '.join(unused)}; fields={{role: name}} or --field selects others")
 
     def scan(self, columns: Columns, T_world_sensor: Floats, time_s: float | None, notes: Notes) -> Scan:
-        """Build a scan of the finite returns in the columns, (N,) each. Positions are float64 if x, y or z need it, else float32."""
+        """Build a scan of the finite returns in columns (N,); others are counted. Positions are float64 if x, y or z need it."""
         values: dict[str, Array] = {}  # m, rad, m/s
         of_sigma = SIGMA if set(SIGMA) <= set(self.names) else ()
         optional = [role for role in ("intensity", "doppler", *of_sigma) if role in self.names]
@@ -331,7 +331,10 @@ class Fields:
             single = {role: np.ascontiguousarray(values[role], np.float32) for role in optional}
         sigmas = np.stack([single[role] for role in of_sigma], axis=1) if of_sigma else None
         scan = Scan(points, T_world_sensor, single.get("intensity"), single.get("doppler"), time_s, sigmas)
-        return finite_returns(scan, notes)
+        finite = np.isfinite(points).all(axis=1) & np.isfinite(single.get("intensity", 0))
+        what = "returns left out: a coordinate or the intensity is not a finite number"
+        notes.count(what, int((~finite).sum()))
+        return scan if finite.all() else with_returns(scan, finite)
 
 
 def columns_of(scan: Scan, points: Array) -> Columns:

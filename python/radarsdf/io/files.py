@@ -66,7 +66,7 @@ def write_whole(path: AnyPath, data: bytes) -> None:
 
 @contextmanager
 def whole_file(path: AnyPath) -> Iterator[BinaryIO]:
-    """Open a file for writing that replaces the one at `path` only once it is on the disk.
+    """Open a file for writing, also by its `name`, that replaces the one at `path` only once it is on the disk.
 
     If the block raises, the old file is unchanged. Links are followed, and the old file's permissions are kept. A killed
     process may leave a hidden file named `.NAME.` and 16 hexadecimal digits in the same folder, which the next call removes.
@@ -76,7 +76,7 @@ def whole_file(path: AnyPath) -> Iterator[BinaryIO]:
     _remove_abandoned(target)
     descriptor, temporary = _open_temporary(target)
     try:
-        with os.fdopen(descriptor, "w+b") as file:
+        with open(temporary, "w+b", opener=lambda *_: descriptor) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

@@ -190,6 +190,7 @@ def encode_glb(
         }
         for number, part in enumerate(parts)
     ]
+    views = [{"buffer": 0, "byteOffset": sum(sizes[:i]), "byteLength": n} for i, n in enumerate(sizes)]
     numbers = dict(zip(of_vertices, range(1, len(parts)), strict=True))
     primitive = {"attributes": numbers, "indices": 0, "material": 0}
     tree = {
@@ -200,9 +201,7 @@ def encode_glb(
         "meshes": [{"primitives": [primitive], "extras": extras or {}}],
         "materials": [material],
         "buffers": [{"byteLength": sum(sizes)}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": sum(sizes[:i]), "byteLength": size} for i, size in enumerate(sizes)
-        ],
+        "bufferViews": views,
         "accessors": accessors,
     }
     if "extensions" in material:

@@ -29,7 +29,7 @@ from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex
 from radarsdf.returns.moving import moving_returns
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Label, Mounted, checked_mountings
-from radarsdf.scans import Scans
+from radarsdf.scans import Scans, all_or_none
 
 _MOST_UNPLACED = 10 * SUBMAP_SCANS  # lost scans to search the map for
 _RANGED = 100  # scans from which the median range is known
@@ -488,8 +488,7 @@ class LiveMap:
             self._check_unsealed()
             scans, origin = self._state.scans(), self._state.origin
         poses = np.stack([scan.pose for scan in scans])
-        intensities = [scan.intensities for scan in scans if scan.intensities is not None]
-        drive = self._drive(scans, poses, intensities=intensities or None)
+        drive = self._drive(scans, poses, intensities=all_or_none([scan.intensities for scan in scans]))
         return fit(drive, config=self.config, progress=progress, origin=origin)
 
     def _check_unsealed(self) -> None:
@@ -497,11 +496,10 @@ class LiveMap:
         check(not self.sealed_scans, f"{sealed}: give the map a folder to keep scans in")
 
     def _drive(self, scans: list[LoggedScan], poses: Floats, **known: Any) -> Scans:
-        speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
         return Scans(
             [scan.points for scan in scans],
             poses,
-            doppler_mps=speeds if len(speeds) == len(scans) else None,
+            doppler_mps=all_or_none([scan.doppler_mps for scan in scans]),
             sensors=None if self._state.mountings is None else [scan.label for scan in scans],
             T_body_sensor=self._state.mountings,
             **known,

@@ -206,10 +206,8 @@ class ScanLog:
             check(scan_id in self._scans, f"the map has no scan {scan_id!r}", KeyError)
             return self._scans[scan_id]
         _, _, pose, time_s, tracked, radar, *blobs = row
-        arrays = [
-            None if blob is None else np.frombuffer(blob, chr(blob[0]), offset=1).copy() for blob in blobs
-        ]
-        held: dict[str, Any] = dict(zip(_KINDS, arrays, strict=True))
+        stored = {name: blob for name, blob in zip(_KINDS, blobs, strict=True) if blob is not None}
+        held: dict[str, Any] = {n: np.frombuffer(b, chr(b[0]), offset=1).copy() for n, b in stored.items()}
         held["points"] = held["points"].reshape(-1, 3)
         mounted = None if radar is None else self._radars[radar]
         return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted, tracked=bool(tracked))
@@ -228,9 +226,8 @@ class ScanLog:
         log.edits += bool(old)
         log._gone = self._gone.union(number for number, *_ in stored.values())
         log._stored -= len(stored)
-        log._write(
-            [(place, scan_id, new[scan_id]) for scan_id, (_, place, *_) in stored.items() if scan_id in new]
-        )
+        kept = {scan_id: place for scan_id, (_, place, *_) in stored.items() if scan_id in new}
+        log._write([(place, scan_id, new[scan_id]) for scan_id, place in kept.items()])
         held = {scan_id: scan for scan_id, scan in new.items() if scan_id not in stored}
         log.num_bytes += sum(scan.num_bytes for scan in held.values())
         log.num_bytes -= sum(log._scans[scan_id].num_bytes for scan_id in held.keys() & log._scans.keys())
@@ -247,7 +244,6 @@ class ScanLog:
         return log
 
     def _write(self, scans: Sequence[tuple[int, ScanId, LoggedScan]]) -> None:
-        """Write scans with their places and ids to the folder."""
         if not scans:
             return
         labels, rows = [radar.label for radar in self._radars], []

@@ -7,13 +7,7 @@ import numpy as np
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.core import CellBlocks, Encoding, VertexTable, cell_keys, marching_cubes_sparse
-from radarsdf.fitting.surface_returns import (
-    BAND_CELLS,
-    CELLS_SMOOTHED,
-    TRUNCATION_CELLS,
-    average_at_corners,
-    normals_at,
-)
+from radarsdf.fitting import surface_returns
 from radarsdf.map.confidence import interpolated
 from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.mesh import Surface
@@ -229,7 +223,7 @@ class GrowingSurface:
         """Compute the normals of the leaf cells in these regions. Return the keys of the changed ones."""
         leaves = self._leaves.gather(regions)
         surfels = self._surfels_of(self._cells.gather(regions))
-        normals = normals_at(_means_of(leaves), surfels, num_threads)
+        normals = surface_returns.normals_at(_means_of(leaves), surfels, num_threads)
         differs = (normals != leaves["normals"]).any(axis=1)
         self._leaves.put(regions, leaves | {"normals": normals})
         return leaves["keys"][differs]
@@ -238,11 +232,11 @@ class GrowingSurface:
         """Recompute distances and evidence that depend on changed leaf cells. Return their regions, ascending."""
         # A ray contributes to the cells of its band, and via shared corners to the neighbours of the last one. Added or removed
         # cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
-        band_cells = max(TRUNCATION_CELLS, BAND_CELLS)
+        band_cells = max(surface_returns.TRUNCATION_CELLS, surface_returns.BAND_CELLS)
         reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(band_cells) + 1)
         leaf_keys, differing = self._find_leaf_cells(regions_of(reached), num_threads)
         reached = np.union1d(reached, cubes_near(differing, _BLOCK_CELLS, 1))
-        smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED))
+        smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, surface_returns.CELLS_SMOOTHED))
         regions = np.intersect1d(smoothed, regions_of(np.union1d(leaf_keys, differing)))
         self._average(regions, leaf_keys, noise, num_threads)
         return regions
@@ -250,7 +244,8 @@ class GrowingSurface:
     def _find_leaf_cells(self, regions: Keys, num_threads: int) -> tuple[Keys, Keys]:
         """Find the leaf cells near `regions`, in which rays changed. Return them, and those that came or went, ascending."""
         rays, _ = self._true_means(regions_near(regions, 1))
-        crossed = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
+        reach_m = self._config.metres(surface_returns.BAND_CELLS)
+        crossed = rays.leaf_keys(self._config.leaf_size_m, reach_m, num_threads)
         self._crossed.put(regions, {"keys": crossed})
         # Bridges depend on medians over blocks of 32 cells, and on their two ends, which they lack at the border.
         own, around = regions_near(regions, 2), regions_near(regions, 3)
@@ -268,7 +263,7 @@ class GrowingSurface:
         weighted = evidence.ReturnsOfCells.of_means(means, noise, config.returns)
         leaf_keys = leaf_keys[within(leaf_keys, near)]
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_corners(table, means, weighted, normals, config, num_threads)
+        distances_m = surface_returns.average_at_corners(table, means, weighted, normals, config, num_threads)
         own = within(leaf_keys, regions)
         values = distances_m[table.leaf_vertices()[1][own]]
         information, hits = evidence.evidence_sums(weighted, leaf_keys[own], num_threads)

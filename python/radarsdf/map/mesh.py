@@ -79,17 +79,23 @@ class Surface:
         threshold = self.tally.threshold(limits.min_confidence)
         return self.part(origin, self.kept(limits), **counts, **vars(threshold))
 
-    def part(self, origin: Floats, kept: Bools, **metadata: float) -> Mesh:
+    def part(self, origin: Floats, kept: Bools, **metadata: Any) -> Mesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
         import trimesh  # noqa: PLC0415 - slow
 
         used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
         rows = np.flatnonzero(used)
-        mesh = trimesh.Trimesh(self.vertices.take(rows, axis=0) + origin, faces, process=False)
-        mesh.vertex_attributes["confidence"] = self.confidence.take(rows)
-        mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m.take(rows)
-        mesh.metadata |= metadata
-        return mesh
+        vertices = self.vertices.take(rows, axis=0) + origin
+        known = {"confidence": self.confidence, "uncertainty_m": self.uncertainty_m}
+        of_rows: dict[str, Any] = {name: values.take(rows) for name, values in known.items()}
+        return trimesh.Trimesh(vertices, faces, process=False, vertex_attributes=of_rows, metadata=metadata)
+
+
+def across_triangles(vertices: Floats, faces: Ints32) -> tuple[Floats, Floats]:
+    """Return the cross products (F, 3) of the edges of triangles (F, 3), and their lengths (F,), twice the areas, m²."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return across, np.sqrt(np.einsum("ni,ni->n", across, across))
 
 
 def with_all(good: Bools, faces: Ints32) -> Bools:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from radarsdf.arrays import Bools, Floats, Floats32, Ints32
+from radarsdf.arrays import Bools, Floats, Floats32
 from radarsdf.checks import check, number, whole_number
 
 VOXEL_M = 0.1
@@ -126,10 +126,3 @@ class Tally:
             return 0.0
         unseen_m2 = once_m2**2 / (2 * twice_m2) if once_m2 > 0 else 0.0
         return true_m2 / (true_m2 + unseen_m2) * true_m2 / existing_m2
-
-
-def across_triangles(vertices: Floats, faces: Ints32) -> tuple[Floats, Floats]:
-    """Return the cross products (F, 3) of the edges of triangles (F, 3), and their lengths (F,), twice the areas, m²."""
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return across, np.sqrt(np.einsum("ni,ni->n", across, across))

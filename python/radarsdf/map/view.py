@@ -1,6 +1,6 @@
 """Predicted scans: the returns of a radar at a pose, and the first surface along its beams."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,12 +11,12 @@ from radarsdf.checks import check, flag, number, whole_number
 from radarsdf.core import SurfaceTracer, cell_keys
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, roughness
-from radarsdf.map.mesh import Surface
-from radarsdf.map.threshold import Limits, across_triangles
+from radarsdf.map.mesh import Surface, across_triangles
+from radarsdf.map.threshold import Limits
 from radarsdf.memory import check_views
 from radarsdf.products import turned
 from radarsdf.returns.sensor import Sensor
-from radarsdf.scans import Scan, Scans
+from radarsdf.scans import Scan, Scans, scans_in_memory
 from radarsdf.threads import resolve_num_threads
 
 _Intensity = Callable[[Floats, Floats], Floats32]  # (N,) from points (N, 3) and a sensor (3,), m
@@ -67,19 +67,17 @@ class View:
     @property
     def world_points(self) -> Floats:
         """(N, 3) returns, world, m."""
-        return Scan(self.points, self.T_world_sensor).world_points
+        return self.scan.world_points
+
+    @property
+    def scan(self) -> Scan:
+        """The returns with their pose."""
+        return Scan(self.points, self.T_world_sensor, self.intensities)
 
     @property
     def scans(self) -> Scans:
         """The returns as a single scan in :class:`radarsdf.io.Scans`, for the writers of :mod:`radarsdf.io`."""
-        return scans_of_views([self])
-
-
-def scans_of_views(views: Iterable[View]) -> Scans:
-    kept = list(views)
-    poses = np.array([view.T_world_sensor for view in kept]).reshape(-1, 4, 4)
-    values = [view.intensities for view in kept if view.intensities is not None]
-    return Scans([view.points for view in kept], poses, values if len(values) == len(kept) else None)
+        return scans_in_memory([self.scan])
 
 
 class DepthImage(NamedTuple):

@@ -248,10 +248,10 @@ class GrowingView(Page, Sink):
 
     def show_scan(self, scan: Scan, time_s: float) -> None:  # noqa: ARG002
         world = np.concatenate([scan.T_world_sensor[None, :3, 3], scan.world_points])
-        add_cloud(self._server, "/returns", self._local(world)[1:], SCAN_COLORS["measured"], 0.15)
+        add_cloud(self._server, "/returns", self.local(world)[1:], SCAN_COLORS["measured"], 0.15)
 
     def show_surface(self, mesh: Any, path: Floats, time_s: float) -> None:  # noqa: ARG002
-        local, server = self._local(mesh.vertices), self._server
+        local, server = self.local(mesh.vertices), self._server
         colors, scale = uncertainty_colors(mesh)
         if not self._framed:
             self._framed = True
@@ -260,10 +260,10 @@ class GrowingView(Page, Sink):
             self._legend.content = as_html("legend", {"label": UNCERTAINTY, "scale": scale})
             add_mesh(server, mesh, local, colors)
             if len(path) > 1:
-                add_path(server, "/path", self._local(path), PATH_COLOR)
+                add_path(server, "/path", self.local(path), PATH_COLOR)
 
     def show_grid(self, grid: Grid, time_s: float) -> None:  # noqa: ARG002
-        free = self._local(grid.centres(grid.free))
+        free = self.local(grid.centres(grid.free))
         add_cloud(self._server, "/free space", free, FREE_COLOR, 0.2 * grid.voxel_size)
 
 

@@ -167,6 +167,7 @@ class Page:
 
     def __init__(self, host: str = LOCALHOST, port: int | None = None) -> None:
         self.host, self.port = host, page_port(host, port)
+        self.url = url_of(host, self.port)
 
     def _start(self) -> None:
         self._server: Any = start_server(self.host, self.port)

@@ -98,11 +98,10 @@ def thinned(mesh: Any, max_vertices: int, edge_m: float) -> tuple[Any, float]:
     a, b, c = corners.T
     used, faces = renumbered(len(rows), corners[(a != b) & (b != c) & (c != a)])
     rows = rows[used]
-    thin = trimesh.Trimesh(vertices[rows], faces, process=False)
+    kept = {name: np.asarray(values)[rows] for name, values in mesh.vertex_attributes.items()}
+    carried = {"vertex_attributes": kept, "metadata": mesh.metadata}
+    thin = trimesh.Trimesh(vertices[rows], faces, process=False, **carried)
     thin.update_faces(thin.unique_faces())
-    thin.metadata |= mesh.metadata
-    for name, values in mesh.vertex_attributes.items():
-        thin.vertex_attributes[name] = np.asarray(values)[rows]
     return thin, spacing_m
 
 
