@@ -57,7 +57,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:
     Raises a TypeError for anything but real numbers, and a ValueError for masked values and integers too large for float64.
     """
     array = values
-    if type(values) is not np.ndarray or values.dtype.kind not in "biuf":  # else the checks take most of the time
+    if type(values) is not np.ndarray or values.dtype.kind not in "biuf":  # arrays need no checks
         refuse_masked(values, name)
         must = f"{name} must be real numbers, and all rows equally long"
         kinds = TypeError, ValueError, RuntimeError  # the last of a tensor that requires a gradient

@@ -280,7 +280,7 @@ class Reflectance:
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)
         few = len(points) <= _MOST_RETURNS  # of few returns, each is its own group
-        groups = np.arange(len(points)) if few else cell_rows(kind, points, directions, incidence)[0].astype(np.int64)
+        groups = np.arange(len(points)) if few else cell_rows(kind, points, directions, incidence)[0]
         counts = np.bincount(groups).astype(np.float64)
         places = _means(points, groups, counts), _means(directions, groups, counts)
         times, share = 1.0, 0.0
@@ -322,9 +322,8 @@ class Reflectance:
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
         incidence = _incidence(self.normals, rows, directions)
         views = Views(directions, ranges_m, incidence, kinds_of(self.normals, rows))
-        found = response(self.coefficients, self.table, views)
-        found += self._cells.sums(near, directions, incidence, num_threads)
-        return found
+        of_cells = self._cells.sums(near, directions, incidence, num_threads)
+        return response(self.coefficients, self.table, views) + of_cells
 
     def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
         """Return a mask (N,) of the directions (N, 3) and ranges (N,), m, near which there were returns."""
@@ -345,8 +344,7 @@ def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats
     return angle
 
 
-def _means(values: Floats32, groups: Ints, counts: Floats) -> Floats32:
-    """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns in groups of these sizes."""
+def _means(values: Floats32, groups: Ints | Ints32, counts: Floats) -> Floats32:
+    """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns in groups of sizes `counts` (G,)."""
     sums = np.stack([np.bincount(groups, column) for column in np.atleast_2d(values.T)])
-    means = (sums / counts).T.reshape(-1, *values.shape[1:])
-    return np.ascontiguousarray(means, np.float32)
+    return np.ascontiguousarray((sums / counts).T.reshape(-1, *values.shape[1:]), np.float32)
