@@ -13,6 +13,19 @@
 
 namespace radarsdf {
 
+// A line in cells: position of its point, and steps along each axis.
+struct CellLine {
+  double position[3], cells_per_m[3], m_per_cell[3];  // negative for descending coordinates
+
+  CellLine(const float* point, const float* direction, double cell_size_m) {
+    for (int axis = 0; axis < 3; ++axis) {
+      position[axis] = point[axis] / cell_size_m;
+      cells_per_m[axis] = direction[axis] / cell_size_m;
+      m_per_cell[axis] = cells_per_m[axis] != 0 ? 1 / cells_per_m[axis] : std::numeric_limits<double>::infinity();
+    }
+  }
+};
+
 // Cells that contain point + t * direction for t in [from_m, to_m]: for (CellWalk cell(...); cell.inside();
 // cell.next()). Call check_rays first.
 //
@@ -20,14 +33,18 @@ namespace radarsdf {
 // next step depends on it.
 class CellWalk {
  public:
-  // bias: offset of the coordinates in keys; kAxisBias for leaf cells.
   CellWalk(const float* point, const float* direction, double from_m, double to_m, double cell_size_m,
            std::int32_t bias = kAxisBias)
-      : to_m_(to_m) {
+      : CellWalk(CellLine(point, direction, cell_size_m), from_m, to_m, 1, bias) {}
+
+  // edge: of the cells, in those of the line; a power of two, so that nothing is rounded. bias: offset of the
+  // coordinates in keys; kAxisBias for leaf cells.
+  CellWalk(const CellLine& line, double from_m, double to_m, double edge, std::int32_t bias) : to_m_(to_m) {
+    const double per_edge = 1 / edge;
     for (int axis = 0; axis < 3; ++axis) {
-      const double position = point[axis] / cell_size_m, cells_per_m = direction[axis] / cell_size_m;
+      const double position = line.position[axis] * per_edge, cells_per_m = line.cells_per_m[axis] * per_edge;
+      const double m_per_cell = line.m_per_cell[axis] * edge;
       const std::int32_t step = cells_per_m >= 0 ? 1 : -1, ahead = step > 0 ? 1 : 0;
-      const double m_per_cell = cells_per_m != 0 ? 1 / cells_per_m : std::numeric_limits<double>::infinity();
       std::int32_t cell = floor_to_int(position + from_m * cells_per_m);
       // Rounding may start one cell too early.
       while ((cell + ahead - position) * m_per_cell < from_m) cell += step;
@@ -64,7 +81,7 @@ class CellWalk {
 
  private:
   struct Axis {
-    double position, m_per_cell;  // of the point, cells; negative for descending coordinates
+    double position, m_per_cell;  // see CellLine
     double next_m;                // distance of the next face along the line
     std::int32_t face, step;      // cells
     std::int32_t ahead;           // 1 if coordinates ascend

@@ -12,10 +12,10 @@ constexpr int kAxisBits = 21;
 constexpr std::int32_t kAxisBias = 1 << (kAxisBits - 1);
 
 // Without SSE4.1 (the baseline) std::floor is a library call.
-template <typename T>
-inline std::int32_t floor_to_int(T value) {
-  const auto truncated = static_cast<std::int32_t>(value);
-  return truncated - static_cast<std::int32_t>(value < static_cast<T>(truncated));
+template <typename Integer = std::int32_t, typename T>
+inline Integer floor_to_int(T value) {
+  const auto truncated = static_cast<Integer>(value);
+  return truncated - static_cast<Integer>(value < static_cast<T>(truncated));
 }
 
 // Spreads the low 21 bits of v to every third bit.

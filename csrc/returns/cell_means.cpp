@@ -6,6 +6,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "lattice/morton.hpp"
 #include "util/bits.hpp"
 #include "util/parallel.hpp"
 #include "util/prefetch.hpp"
@@ -15,14 +16,12 @@ namespace {
 
 constexpr double kDirectionOffset = 0.37;  // keeps bin edges off the axes of the world
 constexpr double kFarthestCell = 1e15;     // index of all farther coordinates and of NaN
-constexpr int kViewsPerCell = 8;           // estimate; with fewer views the table grows
+constexpr int kViewsPerCell = 3;           // estimate; growing a table takes longer than filling it
 constexpr double kCauchyMedians = 2.0;     // scale of the Cauchy weight, in median absolute values
 
 std::uint64_t cell_of(double place) {
   if (!(std::abs(place) < kFarthestCell)) place = kFarthestCell;
-  auto cell = static_cast<std::int64_t>(place);
-  cell -= static_cast<double>(cell) > place;  // std::floor is a function call in the baseline
-  return static_cast<std::uint64_t>(cell);
+  return static_cast<std::uint64_t>(floor_to_int<std::int64_t>(place));
 }
 
 // Packs three coordinates into one number, unique for cells less than 2^20 from the origin.
@@ -70,8 +69,7 @@ Tiles tiles_of(const CellKind& kind, std::size_t kind_number, std::size_t num_ki
 std::int64_t number_cells(const Tiles& tiles, const Views& views, std::int32_t* rows,
                           std::vector<std::uint64_t>* keys) {
   FlatMap numbers(views.count / kViewsPerCell);
-  std::int32_t next = 0, last = -1;
-  std::uint64_t last_key = kEmptyKey;  // that of `last`: views in the order of their places often share large cells
+  std::int32_t next = 0;
   // With millions of views, almost every look-up is a cache miss: prefetching in batches overlaps them.
   std::uint64_t run[64];
   constexpr std::int64_t size = std::size(run);
@@ -83,16 +81,10 @@ std::int64_t number_cells(const Tiles& tiles, const Views& views, std::int32_t* 
       prefetch(table.slots + table.home(run[i - first]));
     }
     for (std::int64_t i = first; i < end; ++i) {
-      const std::uint64_t key = run[i - first];
-      if (key != last_key) {
-        last_key = key;
-        last = numbers.find_or_insert(key, next);
-        if (last == next) {
-          ++next;
-          if (keys != nullptr) keys->push_back(key);
-        }
-      }
-      rows[i] = last;
+      rows[i] = numbers.find_or_insert(run[i - first], next);
+      if (rows[i] < next) continue;
+      ++next;
+      if (keys != nullptr) keys->push_back(run[i - first]);
     }
   }
   return next;

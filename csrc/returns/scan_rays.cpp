@@ -1,9 +1,9 @@
 #include "returns/scan_rays.hpp"
 
 #include <algorithm>
-#include <cmath>
 #include <cstring>
 
+#include "lattice/morton.hpp"
 #include "util/bits.hpp"
 #include "util/parallel.hpp"
 #include "util/vec3.hpp"
@@ -53,8 +53,8 @@ void hash_rays(const float* directions, const float* ranges_m, const float* inte
     std::memcpy(bits, numbers, sizeof bits);
     std::uint64_t coarse = 0, fine = 0;
     for (int k = 0; k < (intensities != nullptr ? 5 : 4); ++k) {
-      const std::int64_t place = k < 4 ? static_cast<std::int64_t>(std::floor(kPerMetre * numbers[k])) : bits[k];
-      coarse = mixed(coarse, static_cast<std::uint32_t>(place));
+      const auto place = [&] { return floor_to_int<std::int64_t>(kPerMetre * numbers[k]); };
+      coarse = mixed(coarse, k < 4 ? static_cast<std::uint32_t>(place()) : bits[k]);
       fine = mixed(fine, bits[k]);
     }
     keys[i] = (coarse & ~kLastBits) | (fine & kLastBits);

@@ -32,28 +32,22 @@ constexpr Slabs slabs_of_block() {
 }
 constexpr Slabs kSlabs = slabs_of_block();
 
-// A ray in cells.
-struct Line {
-  double position[3], cells_per_m[3];  // of its end
-
-  // Cells of a block that may hold parts of the ray from begin_m to end_m, and others.
-  std::uint64_t cells_near(const CellWalk& block, double begin_m, double end_m) const {
-    constexpr double kRounding = 1e-6;
-    constexpr int kLast = (1 << kBlockBits) - 1;
-    std::uint64_t cells = ~std::uint64_t{0};
-    for (int axis = 0; axis < 3; ++axis) {
-      const double lower = position[axis] - kBlockEdge * block.coordinate(axis), slope = cells_per_m[axis];
-      const double begin = lower + begin_m * slope, end = lower + end_m * slope;
-      const auto cell = [](double place) {
-        const int k = static_cast<int>(place);  // 0 from -1 on
-        return static_cast<std::size_t>(k > kLast ? kLast : k < 0 ? 0 : k);
-      };
-      cells &=
-          kSlabs[axis][cell((begin < end ? begin : end) - kRounding)][cell((begin < end ? end : begin) + kRounding)];
-    }
-    return cells;
+// Cells of a block that may hold parts of a line from begin_m to end_m, and others.
+std::uint64_t cells_near(const CellLine& line, const CellWalk& block, double begin_m, double end_m) {
+  constexpr double kRounding = 1e-6;
+  constexpr int kLast = (1 << kBlockBits) - 1;
+  std::uint64_t cells = ~std::uint64_t{0};
+  for (int axis = 0; axis < 3; ++axis) {
+    const double lower = line.position[axis] - kBlockEdge * block.coordinate(axis), slope = line.cells_per_m[axis];
+    const double begin = lower + begin_m * slope, end = lower + end_m * slope;
+    const auto cell = [](double place) {
+      const int k = static_cast<int>(place);  // 0 from -1 on
+      return static_cast<std::size_t>(k > kLast ? kLast : k < 0 ? 0 : k);
+    };
+    cells &= kSlabs[axis][cell((begin < end ? begin : end) - kRounding)][cell((begin < end ? end : begin) + kRounding)];
   }
-};
+  return cells;
+}
 
 }  // namespace
 
@@ -104,16 +98,9 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
       if (!inside || -range_m > last_m) continue;
       // Most of the way is empty: only where regions and blocks hold surfels nearby is the ray followed from cell to
       // cell.
-      Line line;
-      for (int axis = 0; axis < 3; ++axis) {
-        line.position[axis] = points[3 * i + axis] / cell_size_m_;
-        line.cells_per_m[axis] = directions[3 * i + axis] / cell_size_m_;
-      }
+      const CellLine line(points + 3 * i, directions + 3 * i, cell_size_m_);
       double begin_m = -range_m;
-      const auto walk = [&](int bits) {
-        return CellWalk(points + 3 * i, directions + 3 * i, begin_m, last_m, (1 << bits) * cell_size_m_,
-                        kAxisBias >> bits);
-      };
+      const auto walk = [&](int bits) { return CellWalk(line, begin_m, last_m, 1 << bits, kAxisBias >> bits); };
       CellWalk block = walk(kBlockBits);
       std::uint64_t last_region = kEmptyKey;
       while (block.inside() && crossed[i] < 0) {
@@ -132,7 +119,7 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
         }
         const double leaves_m = block.leaves_m();
         const std::uint64_t cells = rows.block(block.key()).mask;
-        if (cells != 0 && (cells & line.cells_near(block, begin_m, std::min(leaves_m, last_m))) != 0) {
+        if (cells != 0 && (cells & cells_near(line, block, begin_m, std::min(leaves_m, last_m))) != 0) {
           int on_end = 0;
           for (CellWalk cell = walk(0); cell.inside(); cell.next()) {
             const double end_m = cell.leaves_m();

@@ -56,14 +56,16 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:
 
     Raises a TypeError for anything but real numbers, and a ValueError for masked values and integers too large for float64.
     """
-    refuse_masked(values, name)
-    must = f"{name} must be real numbers, and all rows equally long"
-    kinds = TypeError, ValueError, RuntimeError  # the last of a tensor that requires a gradient
-    with restating(name, OverflowError), restating(must, *kinds, kind=TypeError):
-        array = np.asarray(values)
-        if array.dtype.kind == "O":  # numbers of other types, or integers with many digits
-            array = array.astype(np.float64)
-    _check_type(array.dtype.kind in "biuf", name, "real numbers", array.dtype)
+    array = values
+    if type(values) is not np.ndarray or values.dtype.kind not in "biuf":  # arrays need no checks
+        refuse_masked(values, name)
+        must = f"{name} must be real numbers, and all rows equally long"
+        kinds = TypeError, ValueError, RuntimeError  # the last of a tensor that requires a gradient
+        with restating(name, OverflowError), restating(must, *kinds, kind=TypeError):
+            array = np.asarray(values)
+            if array.dtype.kind == "O":  # numbers of other types, or integers with many digits
+                array = array.astype(np.float64)
+        _check_type(array.dtype.kind in "biuf", name, "real numbers", array.dtype)
     with np.errstate(over="ignore"):  # overflow becomes infinite, which callers refuse
         return array.astype(dtype, copy=False)
 

@@ -327,7 +327,6 @@ def _report(
 def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads: int) -> Reflectance:
     """Fit intensities of `rays`, ghosts included, in closed form, or the residuals of the network of a map."""
     field, config, scale = contents.field, contents.config, contents.intensity_scale
-    range_limits_m = contents.sensor.range_m  # to which queries of the map are clipped
     assert scale is not None
     known = rays.with_intensity
     if known.any() and not known.all():  # a tile without any counts as the middle of the range
@@ -336,7 +335,7 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     assert rays.intensities is not None
 
     def network(points: Floats32, directions: Floats32, ranges_m: Floats32) -> Floats32:
-        columns = np.column_stack([points, directions, np.clip(ranges_m, *range_limits_m)])
+        columns = np.column_stack([points, directions, np.clip(ranges_m, *contents.sensor.range_m)])
         return evaluate(lambda x: field.intensity(x[:, :3], x[:, 3:6], x[:, 6]), columns).clip(0, 1)
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)

@@ -118,8 +118,7 @@ def intensity(
             return found
         measured = (ranges_m >= nearest_m / RANGE_MARGIN) & (ranges_m <= farthest_m * RANGE_MARGIN)
         if field.reflectance is not None:
-            of_views = directions.numpy(), ranges_m.numpy()
-            measured &= torch.from_numpy(field.reflectance.measured(*of_views))
+            measured &= torch.from_numpy(field.reflectance.measured(directions.numpy(), ranges_m.numpy()))
         return found.where(measured, torch.nan)
 
     return evaluate(of_chunk, np.concatenate([points, sensors], axis=1))

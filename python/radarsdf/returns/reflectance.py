@@ -281,20 +281,21 @@ class Reflectance:
         kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)
         few = len(points) <= _MOST_RETURNS  # of few returns, each is its own group
         groups = np.arange(len(points)) if few else cell_rows(kind, points, directions, incidence)[0]
-        places = _means(points, groups), _means(directions, groups)
+        counts = np.bincount(groups).astype(np.float64)
+        places = _means(points, groups, counts), _means(directions, groups, counts)
         times, share = 1.0, 0.0
         if ask is not None:
             unit_vectors = places[1] / np.linalg.norm(places[1], axis=1, keepdims=True)
-            answers = ask(places[0], unit_vectors, _means(ranges_m, groups))
+            answers = ask(places[0], unit_vectors, _means(ranges_m, groups, counts))
             unit = unit - np.float32(_NETWORK_TIMES) * answers[groups]
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         views = Views(directions, ranges_m, incidence, kinds)
         coefficients, table = fit_response(unit, views)
         left = unit - response(coefficients, table, views)
-        incidence, counts = _means(incidence, groups), np.bincount(groups).astype(np.float64)
+        incidence = _means(incidence, groups, counts)
         del plane, kinds, views  # per-return arrays: frees memory
         weights = (counts / (1 + _CORRELATION * (counts - 1))).astype(np.float32)
-        columns = (*places, incidence, _means(left, groups), weights)
+        columns = (*places, incidence, _means(left, groups, counts), weights)
         options = (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads)
         keys, means, explained = fit_cell_means(_in_metres(_KINDS, leaf_size_m), _TILINGS, *columns, *options)
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
@@ -321,9 +322,8 @@ class Reflectance:
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
         incidence = _incidence(self.normals, rows, directions)
         views = Views(directions, ranges_m, incidence, kinds_of(self.normals, rows))
-        found = response(self.coefficients, self.table, views)
-        found += self._cells.sums(near, directions, incidence, num_threads)
-        return found
+        of_cells = self._cells.sums(near, directions, incidence, num_threads)
+        return response(self.coefficients, self.table, views) + of_cells
 
     def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
         """Return a mask (N,) of the directions (N, 3) and ranges (N,), m, near which there were returns."""
@@ -344,8 +344,7 @@ def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats
     return angle
 
 
-def _means(values: Floats32, groups: Ints | Ints32) -> Floats32:
-    """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns."""
+def _means(values: Floats32, groups: Ints | Ints32, counts: Floats) -> Floats32:
+    """Return the means (G,) or (G, K) of `values` (N,) or (N, K) of returns in groups of sizes `counts` (G,)."""
     sums = np.stack([np.bincount(groups, column) for column in np.atleast_2d(values.T)])
-    means = (sums / np.bincount(groups)).T.reshape(-1, *values.shape[1:])
-    return np.ascontiguousarray(means, np.float32)
+    return np.ascontiguousarray((sums / counts).T.reshape(-1, *values.shape[1:]), np.float32)
