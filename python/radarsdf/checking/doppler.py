@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from radarsdf.arrays import Array, Floats, Ints
-from radarsdf.checking.recording import Finding, ascending_times_s, some_scans
+from radarsdf.checking.recording import COARSE_M, Finding, ascending_times_s, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Agreement, Gain, choose_pairs
 from radarsdf.poses.calibrate import calibrate
@@ -117,8 +117,11 @@ def _compare_block(recording: Scans, times_s: Floats, sign: float, wrong: str | 
             yield Finding("doppler_offset", "warning", evidence)
         tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
         wrong = wrong or tested.contradiction
-        if tested.contradiction is None and tested.clock is not None and tested.clock.note:
-            yield Finding("times_uneven", "warning", tested.clock.note[0])
+        clock = tested.clock
+        if tested.contradiction is None and clock is not None and clock.note:
+            moved_m = velocities.usual_mps * max(clock.errors_s.std(), clock.sigma_s)
+            if moved_m > COARSE_M:
+                yield Finding("times_uneven", "warning", clock.note[0])
     if wrong is not None:
         yield Finding("doppler_contradicts_poses", "warning", f"{wrong[0].upper()}{wrong[1:]}.")
 
