@@ -170,9 +170,8 @@ def delay_of(
         share, _, remaining = slope_of(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
         delays, expected_error, _ = slope_of(expected, left)
-        # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
-        # These are also several times as large as a delay explains. Noise of the Doppler alone, where the velocity is constant, shows
-        # half of any delay, since it is part of both the residuals and the change: 5 scans on a motorway.
+        # Noise of the Doppler alone, which is a part of both, shows half of any delay where the velocity is constant: 5 scans on a motorway.
+        # Other errors of the displacements change with speed, too: by less than half, or several times as much as a delay explains.
         likely = share > 0.5 and needed * expected_error < delays - 0.5 < 1
         if likely and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))
