@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from radarsdf.arrays import Array, Floats, Ints
-from radarsdf.checking.recording import Finding, ascending_times_s, some_scans
+from radarsdf.checking.recording import COARSE_M, Finding, ascending_times_s, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import Agreement, Gain, choose_pairs
 from radarsdf.poses.calibrate import calibrate
@@ -40,8 +40,7 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
             evidence = f"In {without} of {tried} scans no velocity fits 40 % of the Doppler values."
             yield Finding("doppler_without_velocity", "warning", evidence)
         return
-    static = np.concatenate([velocity.static for velocity in velocities if velocity.found])
-    moving = 1 - static.mean()
+    moving = 1 - np.concatenate([velocity.static for velocity in velocities if velocity.found]).mean()
     evidence = f"According to their Doppler, {moving:.1%} of the returns move."
     yield Finding("moving_share", "warning" if moving > _MANY_MOVE else "note", evidence)
     by_doppler = np.array([velocity.velocity_mps for velocity in velocities if velocity.found])
@@ -61,17 +60,14 @@ def _are_speeds(recording: Scans, values: list[Array]) -> bool:
         return False  # Doppler has both signs, or a negative one for approaching returns
     scans, velocities = velocities_of_some(recording, values)
     found = [velocity.velocity_mps for velocity in velocities if velocity.found]
-    if len(scans) < _MIN_SCANS or len(found) < 0.7 * len(scans):
-        return False
-    return bool(np.median(np.linalg.norm(found, axis=1)) > _STILL_MPS)
+    enough = len(scans) >= _MIN_SCANS and len(found) >= 0.7 * len(scans)
+    return enough and bool(np.median(np.linalg.norm(found, axis=1)) > _STILL_MPS)
 
 
 def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> Iterator[Finding]:
     """Compare the directions of velocities (K, 3) of scans (K,) from Doppler with those from poses: sign and yaw."""
     times = ascending_times_s(recording)
     knots = np.arange(len(recording), dtype=np.float64) if times is None else times
-    if len(recording) < _MIN_SCANS:
-        return
     by_poses = velocity_of_poses(recording.poses, knots)[scans]
     inner = (scans > 0) & (scans < len(recording) - 1)
     used = inner & (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
@@ -117,8 +113,11 @@ def _compare_block(recording: Scans, times_s: Floats, sign: float, wrong: str | 
             yield Finding("doppler_offset", "warning", evidence)
         tested = Consistency.of_poses(velocities, times_s[rows], recording.poses[rows])
         wrong = wrong or tested.contradiction
-        if tested.contradiction is None and tested.clock is not None and tested.clock.note:
-            yield Finding("times_uneven", "warning", tested.clock.note[0])
+        clock = tested.clock
+        if tested.contradiction is None and clock is not None and clock.note:
+            moved_m = velocities.usual_mps * max(clock.errors_s.std(), clock.sigma_s)
+            if moved_m > COARSE_M:
+                yield Finding("times_uneven", "warning", clock.note[0])
     if wrong is not None:
         yield Finding("doppler_contradicts_poses", "warning", f"{wrong[0].upper()}{wrong[1:]}.")
 
@@ -171,8 +170,6 @@ def misread_radars(recording: Scans) -> Iterator[tuple[Label, Finding]]:
     rig, poses = recording.rig, recording.sensor_poses
     assert rig is not None
     pairs = choose_pairs(recording.points, poses[:, :3, 3], _PAIRS)
-    if len(pairs) == 0:
-        return
     agreement = Agreement(recording.points, _RETURNS, _QUERIES)
     turns = np.array([np.diag([1.0, *factors, 1.0]) for factors in ((1.0, 1.0), *_READ_AS)])
     for k, label in enumerate(rig.labels):

@@ -13,6 +13,7 @@ from radarsdf.scans import Scans
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
 
+COARSE_M = 0.01  # smaller errors of positions, by rounding or by times, are below the noise of any radar
 _SAMPLE = 40  # scans from which properties of the sensor are estimated
 
 _LEFT_OUT = "No action needed: a fit leaves them out."

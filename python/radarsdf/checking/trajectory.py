@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checking.frames import FULL, Effort
-from radarsdf.checking.recording import Finding, ascending_times_s, some_points
+from radarsdf.checking.recording import COARSE_M, Finding, ascending_times_s, some_points
 from radarsdf.checks import are_rigid
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.agreement import LAGS, MIN_RETURNS, Agreement, Gain, relative
@@ -23,7 +23,6 @@ from radarsdf.scans import Scans
 
 # No imaging radar has most of its returns beyond the first two ranges, or within the third, at its own housing.
 _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
-_COARSE_M = 0.01  # spacing of positions: finer rounding is below the noise of any radar
 _FAST_MPS = 100.0  # faster than cars and drones
 _JUMP = 3.0  # ratio to the neighbouring steps
 _LEAST_JUMP = 0.2  # smallest jump, in spacings of a scan's returns: the resolution
@@ -56,7 +55,7 @@ def check_rounding(recording: Scans) -> Iterator[Finding]:
     positions = recording.poses[:, :3, 3]
     rounded = positions.astype(np.float32)
     step_m = float(np.spacing(np.abs(rounded).max()))
-    if step_m >= _COARSE_M and (rounded == positions).all():
+    if step_m >= COARSE_M and (rounded == positions).all():
         evidence = f"The positions of the poses are float32, which has steps of {step_m:.3g} m there."
         yield Finding("positions_rounded", "warning", evidence)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -197,9 +196,8 @@ def _body_path(
     try:
         path = scans.poses[rows]
     except ValueError:
-        own, doppler_mps = [scans.points[i] for i in rows], chosen(scans.doppler_mps, rows)
-        options: dict[str, Any] = {"imu": imu, "config": config, "progress": False}
-        found = odometry(own, doppler_mps=doppler_mps, times_s=times_s, **options)
+        own, speeds = [scans.points[i] for i in rows], chosen(scans.doppler_mps, rows)
+        found = odometry(own, doppler_mps=speeds, times_s=times_s, imu=imu, config=config, progress=False)
         part = found.longest_segment()
         given, notes, times_s = False, found.report["notes"], times_s[part]
         path = found.poses[part] @ np.linalg.inv(T_body_sensor)

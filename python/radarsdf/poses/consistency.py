@@ -167,12 +167,12 @@ def delay_of(
         # Without the part that a wrong scale explains.
         square = max((scaled**2).sum(), 1e-12)
         left, change, expected = (v - scaled * (v * scaled).sum() / square for v in others)
-        share, error, remaining = slope_of(change, left)
+        share, _, remaining = slope_of(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
         delays, expected_error, _ = slope_of(expected, left)
-        # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
-        # These are also several times as large as a delay explains.
-        likely = share > max(needed * error, 0.5) and abs(delays - 1) < 0.5
+        # Noise of the Doppler alone, which is a part of both, shows half of any delay where the velocity is constant: 5 scans on a motorway.
+        # Other errors of the displacements change with speed, too: by less than half, or several times as much as a delay explains.
+        likely = share > 0.5 and needed * expected_error < delays - 0.5 < 1
         if likely and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))
         if delays + needed * expected_error >= 1:
