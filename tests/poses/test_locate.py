@@ -111,8 +111,9 @@ def test_the_unmapped_half_of_a_hall_is_not_found_in_the_other():
         located(mapped, day)
 
 
-def test_scans_at_the_end_of_a_map_are_found(first):
-    mapped, day = halves(first, 1)
+@pytest.mark.parametrize("place", [hugin, KINDS["slope"]])
+def test_scans_at_the_end_of_a_map_are_found(place):
+    mapped, day = halves(place(seed=1, frames=60), 1)
     found = located(mapped, day)
     known = found.segments >= 0
     assert known[:FEW].all()
