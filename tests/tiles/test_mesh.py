@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+import radarsdf
 import trimesh
 from radarsdf._core import marching_cubes_sparse, mesh_components
 from radarsdf.map.marching_cubes import sparse_lattice
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Threshold
+from scipy.spatial import cKDTree
 
 
 def in_one_go(city, steps, min_triangles):
@@ -66,6 +68,14 @@ def test_export_writes_the_same_mesh(city, tmp_path):
     with pytest.raises(ValueError, match="no surface"):
         city.export(tmp_path / "empty.ply", 0.2, min_component_triangles=10**9, progress=False)
     assert not (tmp_path / "empty.ply").exists()
+
+
+def test_the_index_for_searches_has_the_surface_of_the_mesh(city):
+    mesh, index = city.mesh(city.config.leaf_size_m, progress=False), radarsdf.SurfaceIndex.of(city)
+    distances_m, rows = cKDTree(index.surface.points + index.origin).query(mesh.vertices)
+    assert distances_m.max() < 1e-9
+    assert np.median(np.einsum("ni,ni->n", index.surface.normals[rows], mesh.vertex_normals)) > 0.999
+    assert len(index.surface.points) < 1.1 * len(mesh.vertices)  # those on borders are in both tiles
 
 
 def test_the_threshold_is_that_of_the_whole_map(city):

@@ -1,7 +1,7 @@
 """The interface of maps: public queries, and the abstract methods behind them."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property, partial
 from typing import Any
 
@@ -436,6 +436,10 @@ class Map(ABC):
     @abstractmethod
     def _surface_mesh(self, voxel_size: float, *, box: Any, progress: bool | None, **wanted: Any) -> Any:
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
+
+    def meshes(self, voxel_size: float) -> Iterable[Mesh]:
+        """Return the parts of :meth:`mesh`, of which only one need be in memory."""
+        return [self.mesh(voxel_size, progress=False)]
 
     @abstractmethod
     def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:

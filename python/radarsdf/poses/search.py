@@ -126,7 +126,12 @@ class SurfaceIndex:
     def of(cls, radar_map: Map) -> "SurfaceIndex":
         """Build from the mesh of a map, in its world."""
         leaf_m = radar_map.config.leaf_size_m
-        return cls.of_mesh(radar_map.mesh(leaf_m, progress=False), leaf_m)
+        parts = [cls.of_mesh(mesh, leaf_m) for mesh in radar_map.meshes(leaf_m) if len(mesh.faces)]
+        check(parts, "the map has no surface")
+        points = np.concatenate([part.surface.points + part.origin for part in parts])
+        normals = np.concatenate([part.surface.normals for part in parts])
+        thickness_m = float(np.median([part.surface.thickness_m for part in parts]))
+        return cls.of_surface(OrientedPoints(points, normals, thickness_m), points.mean(axis=0), leaf_m)
 
     @classmethod
     def of_mesh(cls, mesh: Mesh, leaf_m: float) -> "SurfaceIndex":

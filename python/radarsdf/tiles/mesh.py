@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -144,6 +144,17 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted:
     return whole.mesh(np.zeros(3), limits, leaf_cells)
 
 
+def meshes_of(
+    city: TileBlend, voxel_size: float, progress: bool | None = False, **wanted: Any
+) -> Iterator[Mesh]:
+    """Yield the mesh of each tile, which may be empty. Small components that reach a border are kept."""
+    paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
+    for path in paths:
+        vertices, faces, confidence, uncertainty_m, *_ = _read(path).values()
+        part = Surface(vertices, faces, confidence, uncertainty_m, tally, len(faces))
+        yield part.part(np.zeros(3), part.kept(limits, _on_borders(city, vertices)))
+
+
 def viewed_tiles(city: TileBlend, tiles: list[TilePlan]) -> ViewedMap:
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
@@ -176,29 +187,24 @@ def write_tileset(
     """Write ``NAME.json`` and in a folder ``NAME`` a GLB file per tile with triangles.
 
     GLB files hold float32 relative to the origin of the tile, which is float64 in the JSON: precision does not depend on the
-    distance from the world's origin. Components that reach a border are kept.
+    distance from the world's origin.
     """
-    import trimesh  # noqa: PLC0415 - slow
-
     folder = path.with_suffix("")
     check_outputs([path])
     folder.mkdir(exist_ok=True)
     check_outputs([folder / "0_0.glb"])
-    paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     children, corners, count = [], [], np.zeros(2, np.int64)
-    for planned, of_tile in zip(city.tiles, paths, strict=True):
-        vertices, faces, confidence, uncertainty_m, *_ = _read(of_tile).values()
-        part = Surface(vertices, faces, confidence, uncertainty_m, tally, len(faces))
-        used, faces = renumbered(len(vertices), faces[part.kept(limits, _on_borders(city, vertices))])
-        if len(faces) == 0:
+    for planned, mesh in zip(city.tiles, meshes_of(city, voxel_size, progress, **wanted), strict=True):
+        if len(mesh.faces) == 0:
             continue
-        vertices = vertices[used]
         name, origin = f"{planned.name}.glb", city.config.lattice.position(planned.origin_cells)
-        local = vertices - origin
-        normals = {"NORMAL": trimesh.Trimesh(local, faces, process=False).vertex_normals}
+        corners += [*mesh.bounds]
+        count += len(mesh.vertices), len(mesh.faces)
+        mesh.vertices = local = np.asarray(mesh.vertices) - origin
+        normals = {"NORMAL": mesh.vertex_normals}
         # Viewers turn y up into z up, which 3D Tiles have.
         material = MATT | {"pbrMetallicRoughness": _GREY}
-        data = encode_glb(local, faces, normals, material=material, matrix=T_GLTF_WORLD)
+        data = encode_glb(local, mesh.faces, normals, material=material, matrix=T_GLTF_WORLD)
         write_whole(folder / name, data)
         T_world_tile = np.eye(4)
         T_world_tile[:3, 3] = origin
@@ -209,8 +215,6 @@ def write_tileset(
             "transform": T_world_tile.T.ravel().tolist(),  # column-major
         }
         children.append(child)
-        corners += [vertices.min(axis=0), vertices.max(axis=0)]
-        count += len(vertices), len(faces)
     check(children, "no tile has a triangle, so there is nothing to write")
     error_m = float(np.ptp(corners, axis=0).max()) * _ERROR_OF_EDGE
     root = {"boundingVolume": _box(np.array(corners)), "geometricError": error_m}

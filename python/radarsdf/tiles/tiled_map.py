@@ -20,7 +20,7 @@ from radarsdf.map.view import ViewedMap
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
-from radarsdf.tiles.mesh import mesh_of, parts_of, viewed_tiles, write_tileset
+from radarsdf.tiles.mesh import mesh_of, meshes_of, parts_of, viewed_tiles, write_tileset
 from radarsdf.tiles.plan import TilePlan, map_path, report_of
 
 
@@ -46,6 +46,7 @@ class TiledMap(TileBlend):
     """
 
     _viewed: tuple[list[TilePlan], ViewedMap] | None = None
+    meshes = meshes_of
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
