@@ -66,6 +66,8 @@ class Step:
     # Relative difference of the motion that the returns show from that by Doppler. NaN if unknown.
     pull: float = np.nan
     sign: int = 0  # sign of the Doppler as known then: -1 if positive for approaching objects, 0 if unknown
+    # Rates of rotation and translation since the previous scan of its radar, if that is known, and the duration, s.
+    rates: tuple[MotionRate, MotionRate, float] | None = None
 
     @property
     def time_s(self) -> float:
@@ -125,7 +127,6 @@ class Follower:
         self._edits = 0  # of the log, when the poses were read
         self._complete = False  # False while the attributes below change, or if that was interrupted
         self._steps: deque[Step] = deque(maxlen=_STEPS * num_radars)
-        self._rates: deque[tuple[MotionRate, MotionRate]] = deque(maxlen=_STEPS * num_radars - 1)
 
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
@@ -248,7 +249,6 @@ class Follower:
         self._complete = False
         if new is None:  # reset to the state after only these scans
             self._steps.clear()
-            self._rates.clear()
             new = len(steps)
         for i in range(len(steps) - new, len(steps)):
             self._add(steps[i], planes=i >= len(steps) - WINDOW * self.num_radars)
@@ -270,16 +270,27 @@ class Follower:
             before, found = self._steps[-1], step.found
             turn = rotation_vector(before.found.pose[:3, :3].T @ found.pose[:3, :3], found.turn)
             step = dataclasses.replace(step, found=dataclasses.replace(found, turn=turn))
-            duration_s = step.time_s - before.time_s
-            rates = rates_of(before.found.pose, step.found, duration_s) if duration_s > 0 else None
-            if rates is not None or self._rates:
-                self._rates.append(rates or self._rates[-1])
+            step = self._with_rates(step)
         else:
             cell_m = plane_cell_m([step.scan], self.config.leaf_size_m)
             self._tracker = Tracker(cell_m, self.config, WINDOW * self.num_radars)
         self._steps.append(step)
         if planes:
             self._tracker.add(step.scan, step.found)
+
+    def _with_rates(self, step: Step) -> Step:
+        """Return a step with its rates. Narrow radars differ: between two of them, steps of 17 ms turned by 15 degrees in pitch."""
+        own = self._of_radar(step)
+        if len(own) < 2:
+            return step
+        first, duration_s = own[-2].found.pose, step.time_s - own[-2].time_s
+        since = [one.found for one in [*self._steps, step] if one.time_s > own[-2].time_s]
+        turn = rotation_vector(
+            first[:3, :3].T @ step.found.pose[:3, :3], np.sum([one.turn for one in since], axis=0)
+        )
+        covariance = np.sum([one.covariance for one in since], axis=0)
+        found = dataclasses.replace(step.found, turn=turn, covariance=covariance)
+        return dataclasses.replace(step, rates=(*rates_of(first, found, duration_s), duration_s))
 
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
         """Estimate the velocity from the Doppler of a scan, if that yields one."""
@@ -294,18 +305,20 @@ class Follower:
     def _next(self, new: Step, sign: int) -> Step:
         """Register a scan from the previous one."""
         steps = [*list(self._steps)[-2 * self.num_radars :], new]
-        durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
-        turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
+        known = [step.rates for step in self._of_radar(new)[1:-1] if step.rates is not None]
+        durations_s = np.array([duration_s for *_, duration_s in known])
+        # Short steps of a rig follow the prior: without their errors, it would shrink to nothing.
+        turns = TURNS.learnt([turn for turn, *_ in known], durations_s, with_errors=self.num_radars > 1)
+        moves = MOVES.learnt([move for _, move, _ in known], durations_s)
         scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
-        priors = TURNS.learnt(turns, durations_s), MOVES.learnt(moves, durations_s)
-        drive = Drive(scans, times_s, self._velocities(steps, sign), *priors, rig=_rig_of(steps))
-        turn, move = self._rates[-1] if self._rates else (None, None)
-        expected = drive.predict(len(steps) - 1, turn, move)
+        drive = Drive(scans, times_s, self._velocities(steps, sign), turns, moves, rig=_rig_of(steps))
+        rates = steps[-2].rates or ()
+        expected = drive.predict(len(steps) - 1, *rates)
         found = self._tracker.register(drive.scans[-1], expected)
         if drive.rig is None and drive.velocities is not None and sign and not found.agreeing > 0:
             # A sensor that turns faster than predicted was dead-reckoned, or lost.
             _, yaws = sign_significance(drive.scans, drive.velocities, drive.times_s)
-            expected = dataclasses.replace(drive, yaws=yaws, turns=TURNS).predict(len(steps) - 1, turn, move)
+            expected = dataclasses.replace(drive, yaws=yaws, turns=TURNS).predict(len(steps) - 1, *rates)
             found = self._tracker.register(drive.scans[-1], expected)
         pull = (
             np.nan if drive.velocities is None or found.segment else _pull(steps[-2].found, found, expected)

@@ -185,10 +185,17 @@ class Drive:
     yaws: Floats | None = None  # as :attr:`CheckedScans.yaws`
     rig: Rig | None = None  # of several radars. The poses are those of its body
 
-    def predict(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
-        """Predict the step to scan `i` from the rates of the previous one; None if unknown."""
+    def predict(
+        self,
+        i: int,
+        turn: MotionRate | None = None,
+        move: MotionRate | None = None,
+        before_s: float | None = None,
+    ) -> PredictedStep:
+        """Predict the step to scan `i` from rates, if known, of the duration `before_s` until the scan before it; None: of its step."""
         duration_s = float(self.times_s[i] - self.times_s[i - 1])
-        before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
+        if before_s is None:
+            before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
         elapsed_s = (duration_s + before_s) / 2
         if self.inertial.gyroscope is not None:
             turned = self.inertial.gyroscope.step(i - 1)
