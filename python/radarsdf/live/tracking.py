@@ -28,7 +28,7 @@ from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.planes import LEAST_OBSERVED, Tracked, plane_cell_m
 from radarsdf.poses.rigid import rotation_vector, step_vectors
 from radarsdf.poses.search import Lost
-from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Tracker, rates_of, track_drive
+from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Rates, Tracker, rates_of, track_drive
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.rig import Label, Rig
 
@@ -66,8 +66,8 @@ class Step:
     # Relative difference of the motion that the returns show from that by Doppler. NaN if unknown.
     pull: float = np.nan
     sign: int = 0  # sign of the Doppler as known then: -1 if positive for approaching objects, 0 if unknown
-    # Rates of rotation and translation since the previous scan of its radar, if that is known, and the duration, s.
-    rates: tuple[MotionRate, MotionRate, float] | None = None
+    rates: Rates = None, None  # since the previous scan of its radar
+    rates_s: float = 0.0  # time since then. 0: unknown
 
     @property
     def time_s(self) -> float:
@@ -290,7 +290,7 @@ class Follower:
         )
         covariance = np.sum([one.covariance for one in since], axis=0)
         found = dataclasses.replace(step.found, turn=turn, covariance=covariance)
-        return dataclasses.replace(step, rates=(*rates_of(first, found, duration_s), duration_s))
+        return dataclasses.replace(step, rates=rates_of(first, found, duration_s), rates_s=duration_s)
 
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
         """Estimate the velocity from the Doppler of a scan, if that yields one."""
@@ -305,14 +305,14 @@ class Follower:
     def _next(self, new: Step, sign: int) -> Step:
         """Register a scan from the previous one."""
         steps = [*list(self._steps)[-2 * self.num_radars :], new]
-        known = [step.rates for step in self._of_radar(new)[1:-1] if step.rates is not None]
-        durations_s = np.array([duration_s for *_, duration_s in known])
+        known = [step for step in self._of_radar(new)[1:-1] if step.rates_s]
+        durations_s = np.array([step.rates_s for step in known])
         # Short steps of a rig follow the prior: without their errors, it would shrink to nothing.
-        turns = TURNS.learnt([turn for turn, *_ in known], durations_s, with_errors=self.num_radars > 1)
-        moves = MOVES.learnt([move for _, move, _ in known], durations_s)
+        turns = TURNS.learnt([step.rates[0] for step in known], durations_s, with_errors=self.num_radars > 1)
+        moves = MOVES.learnt([step.rates[1] for step in known], durations_s)
         scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
         drive = Drive(scans, times_s, self._velocities(steps, sign), turns, moves, rig=_rig_of(steps))
-        rates = steps[-2].rates or ()
+        rates = steps[-2].rates, steps[-2].rates_s or None
         expected = drive.predict(len(steps) - 1, *rates)
         found = self._tracker.register(drive.scans[-1], expected)
         if drive.rig is None and drive.velocities is not None and sign and not found.agreeing > 0:
