@@ -202,7 +202,6 @@ class Follower:
         raise (Elsewhere if elsewhere else Lost)(msg)
 
     def _refuse_leap(self, new: Step) -> None:
-        """Raise Lost if the velocity by Doppler changes far more than before: its sign or scale may have changed."""
         steps = self._of_radar(new)
         known = [(one.time_s, one.velocity.velocity_mps) for one in steps if one.velocity]
         if new.velocity is None or len(known) < _FEWEST_CHANGES + 2 or not steps[-2].moves:
@@ -216,11 +215,12 @@ class Follower:
             raise Lost(msg)
 
     def doubts(self, step: Step) -> tuple[str, ...]:
-        """Return what its pose assumes of the Doppler."""
-        if step.given or step.velocity is None:
-            return ()
-        check = self._checks[step.logged.label]
-        return check.doubts or ((_NOT_COMPARED,) if check.compared < 2 * _START else ())
+        """Return what its pose assumes of the Doppler. In a rig, that of the other radars moves the body, too."""
+        used = [step, *reversed(self._steps)][: 3 * self.num_radars - 2]
+        labels = dict.fromkeys(one.logged.label for one in used if one.velocity and not one.given)
+        checks = [self._checks[label] for label in labels]
+        notes = [one.doubts or ((_NOT_COMPARED,) if one.compared < 2 * _START else ()) for one in checks]
+        return tuple(dict.fromkeys(note for each in notes for note in each))
 
     def _of_radar(self, new: Step) -> list[Step]:
         return [step for step in [*self._steps, new] if step.logged.label == new.logged.label]
