@@ -177,14 +177,14 @@ def test_rates_of_a_step_lead_to_the_next_one():
     assert_allclose(turning.covariance, R.T @ covariance[3:, 3:] @ R / duration_s**2)
     assert_allclose(moving.covariance, half.T @ covariance[:3, :3] @ half / duration_s**2)
     drive = Drive([np.zeros((0, 3))] * 3, np.array([0.0, 0.2, 0.5]), None)
-    next_step = drive.predict(2, turning, moving)
+    next_step = drive.predict(2, (turning, moving))
     rate = drive.turns.after(turning, 0.25)
     assert_allclose(next_step.turn.mean, 0.3 * rate.mean)
     assert_allclose(next_step.turn.covariance, 0.09 * rate.covariance)
     assert_allclose(next_step.begin_mps, speed)
     expected = (moving.covariance + 0.25 * np.diag(drive.moves.change)) * 0.09
     assert_allclose(next_step.translation_covariance, expected)
-    assert drive.predict(1, None, None).duration_s == 0.2
+    assert drive.predict(1, (None, None)).duration_s == 0.2
     assert drive.usual_turn_rad_s == pytest.approx(0.3)
     fast = dataclasses.replace(drive, velocities=velocities_of(np.tile([0, 25.0, 0], (3, 1)), np.eye(3)))
     assert fast.usual_turn_rad_s == pytest.approx(2 / 25)

@@ -3,8 +3,7 @@
 import contextlib
 import dataclasses
 import operator
-from collections import deque
-from collections.abc import Sequence
+from collections import defaultdict, deque
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,16 +27,16 @@ from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.planes import LEAST_OBSERVED, Tracked, plane_cell_m
 from radarsdf.poses.rigid import rotation_vector, step_vectors
 from radarsdf.poses.search import Lost
-from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Tracker, rates_of, track_drive
+from radarsdf.poses.tracking import MOVES, TURNS, WINDOW, Drive, Rates, Tracker, rates_of, track_drive
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.rig import Label, Rig
 
 _STEPS = 100  # steps from which the motion prior is learnt
 _START = 8  # scans of the initialisation, re-estimated after 2, 4 and 8 with motion, or after each while the sign is open
 _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
-# Least share of the returns that agree while the sign of the Doppler is open: a wrong one places scans metres off.
+# Least share of returns of a known radar that agree while the sign of the Doppler is open: a wrong one places scans metres off.
 _LEAST_AGREEING = 0.1
-_JUDGED = 24  # last scans whose Doppler is compared with the returns
+_COMPARED = 24  # last scans whose Doppler is compared with the returns
 # A comparison of half of them leaves scales open that place scans 5 % of the path off.
 _NOT_COMPARED = f"Assumed: the Doppler is right; the returns decide once {2 * _START} scans moved."
 _PARTED = 3  # last scans that suggest this by agreeing less than those before
@@ -66,6 +65,8 @@ class Step:
     # Relative difference of the motion that the returns show from that by Doppler. NaN if unknown.
     pull: float = np.nan
     sign: int = 0  # sign of the Doppler as known then: -1 if positive for approaching objects, 0 if unknown
+    rates: Rates = None, None  # since the previous scan of its radar
+    rates_s: float = 0.0  # time since then. 0: unknown
 
     @property
     def time_s(self) -> float:
@@ -107,13 +108,48 @@ class Track:
 
 
 @dataclass
-class _Judged:
-    """Last comparison of the Doppler of a radar with its returns."""
+class _DopplerCheck:
+    """Comparison of the Doppler of a radar with its returns."""
 
-    time_s: float = -np.inf  # of its last scan
-    patience: int = _START // 2  # scans until the next one
+    time_s: float = -np.inf  # of the last scan compared
+    patience: int = _START // 2  # scans until the next comparison
     compared: int = 0  # scans
     doubts: tuple[str, ...] = ()
+
+    def update(self, steps: list[Step], config: FitConfig) -> None:
+        """Compare the last scans of the radar, if due. Raise Lost if their returns exclude the Doppler."""
+        without = [i for i, step in enumerate(steps) if step.velocity is None or step.given]
+        steps = steps[max(without, default=-1) + 1 :][-_COMPARED:]
+        count, since = len(steps), sum(step.time_s > self.time_s for step in steps)
+        due = count in (_START, 2 * _START)
+        if count < _START or not (due or (since >= self.patience and self._suspects(steps))):
+            return
+        # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
+        self.time_s, self.patience = steps[-1].time_s, self.patience * (1 if due else 2)
+        with contextlib.suppress(NoVelocityError):
+            self.doubts = self._compare(_drive_of(steps), config)
+            self.compared = count
+
+    def _suspects(self, steps: list[Step]) -> bool:
+        pulls = np.array([step.pull for step in steps if np.isfinite(step.pull)])[-_START:]
+        agreeing = np.array([step.found.agreeing for step in steps])
+        pulled = len(pulls) == _START and abs(pulls.mean()) > _PULLED + ERRORS * pulls.std() / np.sqrt(_START)
+        parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
+        return bool(pulled or parted or self.doubts or not self.compared)
+
+    def _compare(self, drive: Drive, config: FitConfig) -> tuple[str, ...]:
+        velocities, begin = drive.velocities, f"Scan 0 of these is that at {drive.times_s[0]:.6f} s."
+        assert velocities is not None
+        tested = Consistency.of_returns(drive, config)
+        other = tested.contradicted if velocities.offset is None else None
+        if other is not None and not other.confirmed:
+            return (f"Assumed: the Doppler is right; {other.words('the returns')}. {begin}",)
+        trusted, notes = tested.applied(velocities)
+        if trusted is None:
+            self.time_s = -np.inf  # the next scans are compared, too
+            msg = f"{notes[-1]} {begin} Give the poses of this scan and the next ones, or leave their Doppler out"
+            raise Lost(msg)
+        return tuple(f"{note} {begin}" for note in notes)
 
 
 class Follower:
@@ -121,11 +157,10 @@ class Follower:
 
     def __init__(self, config: FitConfig, num_radars: int) -> None:
         self.config, self.num_radars = config, num_radars
-        self._judged: dict[Label | None, _Judged] = {}  # by label of a radar
+        self._checks: defaultdict[Label | None, _DopplerCheck] = defaultdict(_DopplerCheck)  # by radar
         self._edits = 0  # of the log, when the poses were read
         self._complete = False  # False while the attributes below change, or if that was interrupted
         self._steps: deque[Step] = deque(maxlen=_STEPS * num_radars)
-        self._rates: deque[tuple[MotionRate, MotionRate]] = deque(maxlen=_STEPS * num_radars - 1)
 
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
@@ -138,100 +173,57 @@ class Follower:
                 raise Elsewhere(msg)
             return [new]
         last = self._steps[-1]
-        at_once = new.logged.label != last.logged.label and new.time_s == last.time_s
-        if not (new.time_s > last.time_s or at_once):
+        if new.time_s < last.time_s or (new.time_s == last.time_s and new.logged.label == last.logged.label):
             msg = f"a scan without a pose must be later than the one before it, at {last.time_s:.6f} s"
             raise ValueError(msg)
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
+        self._refuse_unobserved(new, found)
+        self._refuse_leap(new)
+        self._checks[new.logged.label].update(self._of_radar(found[-1]), self.config)
+        return found
+
+    def _refuse_unobserved(self, new: Step, found: list[Step]) -> None:
+        """Raise Lost if the returns show the pose of a scan nowhere, or neither they nor its Doppler show the motion."""
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
         fewest = _OBSERVED_STEPS * self.num_radars  # beyond the initialisation, which decides the sign
         observed = [step.found.observed[0] for step in self._steps if not step.given][-fewest:]
-        sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
-        sign_open = sign_open and len(self._of_radar(new)) > 1  # other radars see other places
-        unlike = sign_open and found[-1].found.agreeing < _LEAST_AGREEING
-        elsewhere = unlike or any(step.found.segment for step in found)
         unobserved = len(observed) == fewest and np.median(observed) < LEAST_OBSERVED
-        if elsewhere or (unobserved and not by_doppler):
-            nowhere = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
-            why = nowhere if elsewhere else "the returns alone do not observe the motion of the sensor"
-            msg = f"{why}: give its pose, or its Doppler (doppler_mps)"
-            if logged.doppler_mps is not None and not by_doppler:
-                msg += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
-            raise (Elsewhere if elsewhere else Lost)(msg)
-        if (leap_mps := self._leap_mps(new)) is not None:
-            msg = f"{NOT_USED}: its velocity changes by {leap_mps:.1f} m/s, far more than before: give the pose of the scan"
-            raise Lost(msg)
-        self._judge(found[-1])
-        return found
+        unsigned = new.velocity is not None and not by_doppler and len(self._of_radar(new)) > 1
+        unlike = unsigned and found[-1].found.agreeing < _LEAST_AGREEING
+        elsewhere = unlike or any(step.found.segment for step in found)
+        if not elsewhere and (by_doppler or not unobserved):
+            return
+        nowhere = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
+        why = nowhere if elsewhere else "the returns alone do not observe the motion of the sensor"
+        msg = f"{why}: give its pose, or its Doppler (doppler_mps)"
+        if new.logged.doppler_mps is not None and not by_doppler:
+            msg += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
+        raise (Elsewhere if elsewhere else Lost)(msg)
 
-    def _leap_mps(self, new: Step) -> float | None:
-        """Return the change of the velocity by Doppler, m/s, if it exceeds those before: its sign or scale may have changed."""
+    def _refuse_leap(self, new: Step) -> None:
         steps = self._of_radar(new)
         known = [(one.time_s, one.velocity.velocity_mps) for one in steps if one.velocity]
         if new.velocity is None or len(known) < _FEWEST_CHANGES + 2 or not steps[-2].moves:
-            return None
+            return
         times_s, velocities = (np.array(columns) for columns in zip(*known, strict=True))
         changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / np.sqrt(np.diff(times_s))
         usual = float(np.sqrt((changes[:-1] ** 2).mean()))
         leap_mps = float(np.linalg.norm(velocities[-1] - velocities[-2]))
-        fast = leap_mps > _FASTEST_MPS2 * (times_s[-1] - times_s[-2])
-        return leap_mps if fast and changes[-1] > _LEAP * usual else None
+        if leap_mps > _FASTEST_MPS2 * (times_s[-1] - times_s[-2]) and changes[-1] > _LEAP * usual:
+            msg = f"{NOT_USED}: its velocity changes by {leap_mps:.1f} m/s, far more than before: give the pose of the scan"
+            raise Lost(msg)
 
     def doubts(self, step: Step) -> tuple[str, ...]:
-        """Return what its pose assumes of the Doppler."""
-        if step.given or step.velocity is None:
-            return ()
-        judged = self._judged.get(step.logged.label, _Judged())
-        return judged.doubts or ((_NOT_COMPARED,) if judged.compared < 2 * _START else ())
+        """Return what its pose assumes of the Doppler. In a rig, that of the other radars moves the body, too."""
+        used = [step, *reversed(self._steps)][: 3 * self.num_radars - 2]
+        labels = dict.fromkeys(one.logged.label for one in used if one.velocity and not one.given)
+        checks = [self._checks[label] for label in labels]
+        notes = [one.doubts or ((_NOT_COMPARED,) if one.compared < 2 * _START else ()) for one in checks]
+        return tuple(dict.fromkeys(note for each in notes for note in each))
 
     def _of_radar(self, new: Step) -> list[Step]:
-        """Return the scans of the same radar, with the new one."""
         return [step for step in [*self._steps, new] if step.logged.label == new.logged.label]
-
-    def _judge(self, new: Step) -> None:
-        """Compare the Doppler of the last scans with the returns, if due. Raise Lost if these exclude it."""
-        steps, judged = self._of_radar(new), self._judged.setdefault(new.logged.label, _Judged())
-        without = [i for i, step in enumerate(steps) if step.velocity is None or step.given]
-        steps = steps[max(without, default=-1) + 1 :][-_JUDGED:]
-        count, since = len(steps), sum(step.time_s > judged.time_s for step in steps)
-        due = count in (_START, 2 * _START)
-        if count < _START or (since < judged.patience and not due):
-            return
-        pulls = np.array([step.pull for step in steps if np.isfinite(step.pull)])[-_START:]
-        agreeing = np.array([step.found.agreeing for step in steps])
-        pulled = len(pulls) == _START and abs(pulls.mean()) > _PULLED + ERRORS * pulls.std() / np.sqrt(_START)
-        parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
-        if not (due or pulled or parted or judged.doubts or not judged.compared):
-            return
-        # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
-        judged.time_s, judged.patience = new.time_s, judged.patience * (1 if due else 2)
-        scans, times_s = [step.sensor_scan for step in steps], np.array([step.time_s for step in steps])
-        points, speeds = zip(*((one.logged.points, one.logged.doppler_mps) for one in steps), strict=True)
-        try:
-            velocities = SensorVelocities.of(points, speeds, times_s).scaled(new.sign or 1.0)
-        except NoVelocityError:
-            return
-        fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
-        yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
-        drive = Drive(scans, times_s, velocities, yaws=yaws)
-        if (radar := new.logged.radar) is not None:
-            # A narrow radar hardly shows its turns, but all radars show those of the body.
-            turns = step_vectors(np.stack([step.found.pose @ radar.T_body_sensor for step in steps]))[:, 3:]
-            unbiased = MotionRate(np.zeros(3), FIRST_BIAS_RAD_S**2 * np.eye(3))
-            gyroscope = Gyroscope(turns, np.diff(times_s), unbiased)
-            drive = dataclasses.replace(drive, inertial=Inertial(gyroscope))
-        tested = Consistency.of_returns(drive, self.config)
-        trusted, notes = tested.applied(velocities)
-        begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
-        other = tested.contradicted if velocities.offset is None else None
-        if other is not None and not other.confirmed:
-            trusted, notes = velocities, [f"Assumed: the Doppler is right; {other.words('the returns')}."]
-        if trusted is None:
-            judged.time_s = -np.inf  # the next scans are judged, too
-            msg = f"{notes[-1]} {begin} Give the poses of this scan and the next ones, or leave their Doppler out"
-            raise Lost(msg)
-        judged.compared, judged.doubts = count, tuple(f"{note} {begin}" for note in notes)
 
     def track(self, found: list[Step]) -> Track:
         """Return the track that continues with the scans returned by :meth:`seek`."""
@@ -248,7 +240,6 @@ class Follower:
         self._complete = False
         if new is None:  # reset to the state after only these scans
             self._steps.clear()
-            self._rates.clear()
             new = len(steps)
         for i in range(len(steps) - new, len(steps)):
             self._add(steps[i], planes=i >= len(steps) - WINDOW * self.num_radars)
@@ -269,11 +260,7 @@ class Follower:
         if self._steps:
             before, found = self._steps[-1], step.found
             turn = rotation_vector(before.found.pose[:3, :3].T @ found.pose[:3, :3], found.turn)
-            step = dataclasses.replace(step, found=dataclasses.replace(found, turn=turn))
-            duration_s = step.time_s - before.time_s
-            rates = rates_of(before.found.pose, step.found, duration_s) if duration_s > 0 else None
-            if rates is not None or self._rates:
-                self._rates.append(rates or self._rates[-1])
+            step = self._with_rates(dataclasses.replace(step, found=dataclasses.replace(found, turn=turn)))
         else:
             cell_m = plane_cell_m([step.scan], self.config.leaf_size_m)
             self._tracker = Tracker(cell_m, self.config, WINDOW * self.num_radars)
@@ -281,35 +268,47 @@ class Follower:
         if planes:
             self._tracker.add(step.scan, step.found)
 
+    def _with_rates(self, step: Step) -> Step:
+        """Return a step with its rates. Narrow radars differ: between two of them, steps of 17 ms turned by 15 degrees in pitch."""
+        own = self._of_radar(step)
+        if len(own) < 2:
+            return step
+        first, duration_s = own[-2].found.pose, step.time_s - own[-2].time_s
+        since = [one.found for one in [*self._steps, step] if one.time_s > own[-2].time_s]
+        turn = np.sum([one.turn for one in since], axis=0)
+        turn = rotation_vector(first[:3, :3].T @ step.found.pose[:3, :3], turn)
+        covariance = np.sum([one.covariance for one in since], axis=0)
+        found = dataclasses.replace(step.found, turn=turn, covariance=covariance)
+        return dataclasses.replace(step, rates=rates_of(first, found, duration_s), rates_s=duration_s)
+
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
-        """Estimate the velocity from the Doppler of a scan, if that yields one."""
         if logged.doppler_mps is None:
             return None
         own = [step for step in self._steps if step.logged.label == logged.label]
-        others = [step.logged.doppler_mps for step in own[-WINDOW:]]
-        known = [speeds for speeds in others if speeds is not None]
+        known = [one.logged.doppler_mps for one in own[-WINDOW:] if one.logged.doppler_mps is not None]
         found = sensor_velocities([logged.points], [logged.doppler_mps], known)[0]
         return found if found.found else None
 
     def _next(self, new: Step, sign: int) -> Step:
         """Register a scan from the previous one."""
         steps = [*list(self._steps)[-2 * self.num_radars :], new]
-        durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
-        turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
+        known = [step for step in self._of_radar(new)[1:-1] if step.rates_s]
+        durations_s = np.array([step.rates_s for step in known])
+        # Short steps of a rig follow the prior: without their errors, it would shrink to nothing.
+        turns = TURNS.learnt([step.rates[0] for step in known], durations_s, with_errors=self.num_radars > 1)
+        moves = MOVES.learnt([step.rates[1] for step in known], durations_s)
         scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
-        priors = TURNS.learnt(turns, durations_s), MOVES.learnt(moves, durations_s)
-        drive = Drive(scans, times_s, self._velocities(steps, sign), *priors, rig=_rig_of(steps))
-        turn, move = self._rates[-1] if self._rates else (None, None)
-        expected = drive.predict(len(steps) - 1, turn, move)
+        drive = Drive(scans, times_s, self._velocities(steps, sign), turns, moves, rig=_rig_of(steps))
+        rates = steps[-2].rates, steps[-2].rates_s
+        expected = drive.predict(len(steps) - 1, *rates)
         found = self._tracker.register(drive.scans[-1], expected)
         if drive.rig is None and drive.velocities is not None and sign and not found.agreeing > 0:
             # A sensor that turns faster than predicted was dead-reckoned, or lost.
             _, yaws = sign_significance(drive.scans, drive.velocities, drive.times_s)
-            expected = dataclasses.replace(drive, yaws=yaws, turns=TURNS).predict(len(steps) - 1, turn, move)
+            expected = dataclasses.replace(drive, yaws=yaws, turns=TURNS).predict(len(steps) - 1, *rates)
             found = self._tracker.register(drive.scans[-1], expected)
-        pull = (
-            np.nan if drive.velocities is None or found.segment else _pull(steps[-2].found, found, expected)
-        )
+        unknown = drive.velocities is None or found.segment > 0
+        pull = np.nan if unknown else _pull(steps[-2].found, found, expected)
         return dataclasses.replace(new, found=found, pull=pull, sign=sign)
 
     def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
@@ -395,9 +394,25 @@ class Follower:
         return sign, track_drive(drive, self.config)[1]
 
 
-def _rig_of(steps: Sequence[Step]) -> Rig | None:
+def _rig_of(steps: list[Step]) -> Rig | None:
     known = [step.logged.radar for step in steps if step.logged.radar is not None]
     return Rig.of([radar.label for radar in known], dict(known)) if known else None
+
+
+def _drive_of(steps: list[Step]) -> Drive:
+    """Return scans of one radar with its Doppler, for a comparison. Raise a NoVelocityError if that yields no velocities."""
+    times_s, scans = np.array([step.time_s for step in steps]), [step.sensor_scan for step in steps]
+    points, speeds = zip(*((step.logged.points, step.logged.doppler_mps) for step in steps), strict=True)
+    velocities = SensorVelocities.of(points, speeds, times_s).scaled(steps[-1].sign or 1.0)
+    fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
+    yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
+    inertial = Inertial()
+    if (radar := steps[-1].logged.radar) is not None:
+        # A narrow radar hardly shows its turns, but all radars show those of the body.
+        turns = step_vectors(np.stack([step.found.pose @ radar.T_body_sensor for step in steps]))[:, 3:]
+        unbiased = MotionRate(np.zeros(3), FIRST_BIAS_RAD_S**2 * np.eye(3))
+        inertial = Inertial(Gyroscope(turns, np.diff(times_s), unbiased))
+    return Drive(scans, times_s, velocities, yaws=yaws, inertial=inertial)
 
 
 def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:

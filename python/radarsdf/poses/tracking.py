@@ -167,6 +167,8 @@ LATERAL_MPS2 = 2.0
 SLOW_TURN_RAD_S = 0.1
 _GYROSCOPE_RAD = 0.003  # initial deviation of a step's rotation by a gyroscope
 
+Rates = tuple[MotionRate | None, MotionRate | None]  # rotation, rad/s, and translation, m/s, if known
+
 
 @dataclass(frozen=True)
 class Drive:
@@ -185,15 +187,16 @@ class Drive:
     yaws: Floats | None = None  # as :attr:`CheckedScans.yaws`
     rig: Rig | None = None  # of several radars. The poses are those of its body
 
-    def predict(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
-        """Predict the step to scan `i` from the rates of the previous one; None if unknown."""
+    def predict(self, i: int, rates: Rates, before_s: float | None = None) -> PredictedStep:
+        """Predict the step to scan `i` from the rates until the scan before it, of its step or of the duration `before_s`."""
         duration_s = float(self.times_s[i] - self.times_s[i - 1])
-        before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
+        if before_s is None:
+            before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
         elapsed_s = (duration_s + before_s) / 2
         if self.inertial.gyroscope is not None:
             turned = self.inertial.gyroscope.step(i - 1)
         else:
-            turned = self.turns.after(turn, elapsed_s).integrate(duration_s)
+            turned = self.turns.after(rates[0], elapsed_s).integrate(duration_s)
             if self.yaws is not None and np.isfinite(yaw := self.yaws[0, i - 1]):
                 before = turned.covariance.copy()
                 if self.turns is TURNS:  # not learnt yet, and expects slower turns
@@ -202,7 +205,7 @@ class Drive:
                 mean = turned.mean + gain * (yaw - turned.mean[2])
                 turned = MotionRate(mean, before - np.outer(gain, before[2]))
         if self.velocities is None:
-            velocity = self.moves.after(move, elapsed_s)
+            velocity = self.moves.after(rates[1], elapsed_s)
             covariance = velocity.integrate(duration_s).covariance
             return PredictedStep(turned, velocity.mean, velocity.mean, covariance, duration_s)
         if isinstance(self.velocities, BodyVelocities):
@@ -251,9 +254,6 @@ class Drive:
         return [*motions, DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns)]
 
 
-Rates = tuple[MotionRate | None, MotionRate | None]  # rotation, rad/s, and translation, m/s, if known
-
-
 def track_drive(
     drive: Drive, config: FitConfig, progress: bool | None = False
 ) -> tuple[Drive, list[Tracked]]:
@@ -288,7 +288,7 @@ def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rate
     rates: list[Rates] = []
     last: Rates = drive.first_turn, None
     for i, scan in enumerate(drive.scans):
-        predicted = drive.predict(i, *last) if i else None
+        predicted = drive.predict(i, last) if i else None
         now = Tracked(np.eye(4)) if predicted is None else tracker.register(scan, predicted)
         tracker.add(scan, now)
         if predicted is not None:
