@@ -99,10 +99,7 @@ def plane_equations(
     planes = planes_of(rays, surfels, num_threads)
     noise = rig_noise(surfels, rays, config.returns, num_threads)
     # Ghosts of the ground turned a radar that looks aside over a car park by 0.8 degrees.
-    flat = np.flatnonzero(surfels.is_flat())
-    for rows, own in zip(rays.rows_of_sensors(), noise.of_sensors, strict=True):
-        crossed = first_crossed(surfels, flat, rays.select(rows), own, num_threads) >= 0
-        planes[rows] = np.where(crossed, np.int32(-1), planes[rows])
+    planes[first_crossed(surfels, np.flatnonzero(surfels.is_flat()), rays, noise, num_threads) >= 0] = -1
     # Of one or two returns of a radar on a plane of another, chance and the cell decide: they turned a simulated radar by 0.8 degrees.
     on = np.flatnonzero(planes >= 0)
     plane, radar = planes[on], radars.of_scan[rays.scans[on]]

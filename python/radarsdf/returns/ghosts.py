@@ -9,7 +9,7 @@ import numpy as np
 
 from radarsdf.arrays import Bools, Ints, Ints32
 from radarsdf.core import SurfelMap
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MeanRays
@@ -104,5 +104,14 @@ def first_crossed(
     chosen = (centres, normals, np.sqrt(variances[:, :1]), reach_m[:, None])
     keys, of_planes = surfels.keys[surfels.cell_of_plane[planes]], np.concatenate(chosen, 1)
     surfel_map = SurfelMap(keys, of_planes.astype(np.float32), surfels.cell_size_m)
-    limits = noise.range_m, noise.angle_rad, _MARGIN * surfels.cell_size_m, _SIGMAS
-    return surfel_map.first_crossings(rays.points, rays.directions, rays.ranges_m, *limits, num_threads)
+
+    def first_of(some: Rays | MeanRays, own: SensorNoise) -> Ints32:
+        limits = own.range_m, own.angle_rad, _MARGIN * surfels.cell_size_m, _SIGMAS
+        return surfel_map.first_crossings(some.points, some.directions, some.ranges_m, *limits, num_threads)
+
+    if not isinstance(noise, RigNoise) or isinstance(rays, MeanRays):  # mean rays are of all radars
+        return first_of(rays, noise)
+    first = np.empty(len(rays), np.int32)
+    for rows, own in zip(rays.rows_of_sensors(), noise.of_sensors, strict=True):
+        first[rows] = first_of(rays.select(rows), own)
+    return first
