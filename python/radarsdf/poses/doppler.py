@@ -295,7 +295,12 @@ class BodyVelocities(SensorVelocities):
         off = self.of_radars_mps[:, rows] - body_mps + np.einsum("kij,fj->kfi", self.levers, rates)
         information = self._information[:, rows]
         sums = np.einsum("kfij,kfj->ki", information, off)
-        biases = np.linalg.solve(information.sum(axis=1), sums[:, :, None])[:, :, 0]
+        variances = np.linalg.inv(information.sum(axis=1))
+        biases = np.einsum("kij,kj->ki", variances, sums)
+        # What they have in common stays in the velocity of the body, which each radar knows up to its systematic error.
+        common_mps = self.common_sigma * float(np.linalg.norm(body_mps, axis=1).mean())
+        weights = np.linalg.inv(variances + common_mps**2 * np.eye(3))
+        biases -= np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, biases))
         return replace(self, of_radars_mps=self.of_radars_mps - biases[:, None], agree=True)
 
     @cached_property
