@@ -438,7 +438,7 @@ class Map(ABC):
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     def meshes(self, voxel_size: float) -> Iterable[Mesh]:
-        """Return the parts of :meth:`mesh`, of which only one need be in memory."""
+        """Return :meth:`mesh` at this voxel size, m, in parts, of which only one need be in memory at a time."""
         return [self.mesh(voxel_size, progress=False)]
 
     @abstractmethod
