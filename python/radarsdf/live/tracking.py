@@ -217,10 +217,12 @@ class Follower:
     def doubts(self, step: Step) -> tuple[str, ...]:
         """Return what its pose assumes of the Doppler. In a rig, that of the other radars moves the body, too."""
         used = [step, *reversed(self._steps)][: 3 * self.num_radars - 2]
-        labels = dict.fromkeys(one.logged.label for one in used if one.velocity and not one.given)
-        checks = [self._checks[label] for label in labels]
-        notes = [one.doubts or ((_NOT_COMPARED,) if one.compared < 2 * _START else ()) for one in checks]
-        return tuple(dict.fromkeys(note for each in notes for note in each))
+        notes = list[str]()
+        for label in dict.fromkeys(one.logged.label for one in used if one.velocity and not one.given):
+            check = self._checks[label]
+            doubts = check.doubts or ((_NOT_COMPARED,) if check.compared < 2 * _START else ())
+            notes += [note if label is None else f"{label}: {note}" for note in doubts]
+        return tuple(notes)
 
     def _of_radar(self, new: Step) -> list[Step]:
         return [step for step in [*self._steps, new] if step.logged.label == new.logged.label]
