@@ -20,9 +20,8 @@ _COMMON = SensorVelocities.common_sigma
 PRIOR = np.array([*[0.5] * 3, *[0.2] * 3, 0.1, _COMMON, _COMMON, 0.01])
 _FIXED = 1e12  # information that fixes the reference
 _WEAK = 1e-4
-# Cell edges by iteration, relative to a map's surfels, as in tracking; 0: Doppler alone. In smaller ones, returns of a radar with large
-# noise change their planes as its mounting changes: gradients show a third of its error in cells of 1, and 0.55 in those of 2 and 3.
-_CELLS = (0, 0, 0, 4, 4, 2, 2, 2, 2, 2, 2, 2)
+# Cell edges by iteration, relative to a map's surfels; 0: Doppler alone.
+_CELLS = (0, 0, 0, 2, 2, 1, 1, 1, 1, 1, 1, 1)
 _SIGMAS2 = 4.0  # squared scale of the Geman-McClure weight
 _BENT = 10.0  # most changes that count, medians: a straight path may bend at its ends, where an offset wrong by 70 ms was known to 3
 _SLOW = 0.001  # standard deviation of slowly changing errors of velocities, share of the speed
