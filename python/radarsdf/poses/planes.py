@@ -202,9 +202,7 @@ def planes_of(rays: Rays, surfels: Surfels, num_threads: int) -> Ints32:
 
 _CELLS = 4.0, 2.0  # cell edges, coarse to fine, relative to a map's surfels
 _ITERATIONS = 8  # maximum at each cell size
-_SETTLED = 0.5, 0.1  # last steps at these, standard deviations: coarse cells only lead to the fine ones
-# Curvature of the robust cost of Gaussian residuals, relative to the sum of its weights; 0.53 with 30 % of uniform outliers.
-_CURVATURE = 0.58
+_SETTLED = 0.3, 0.03  # tolerances at these, standard deviations: coarse cells only lead to the fine ones
 _MOST_RETURNS = 2000  # of a scan
 _LEAST_VARIANCE = 1e-12  # of a prior, m² and rad²
 _SHIFTS = 0.0, 1.0, -1.0, 2.0, -2.0  # cells, beyond the extent of single objects
@@ -264,7 +262,7 @@ class PlaneMap:
                 hessian, gradient = _discount_tilts(*equations)
                 total = hessian + information
                 off = gradient + information @ increments(mean, pose)
-                step = -lapack.dgesv(_CURVATURE * hessian + information, off)[2]
+                step = -lapack.dgesv(total, off)[2]
                 pose = moved(pose, step)
                 if step @ total @ step < 6 * settled**2:
                     break
