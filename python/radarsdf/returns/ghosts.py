@@ -9,7 +9,7 @@ import numpy as np
 
 from radarsdf.arrays import Bools, Ints, Ints32
 from radarsdf.core import SurfelMap
-from radarsdf.returns.noise import RigNoise, SensorNoise
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MeanRays
@@ -109,9 +109,9 @@ def first_crossed(
         limits = own.range_m, own.angle_rad, _MARGIN * surfels.cell_size_m, _SIGMAS
         return surfel_map.first_crossings(some.points, some.directions, some.ranges_m, *limits, num_threads)
 
-    if not isinstance(noise, RigNoise) or isinstance(rays, MeanRays):  # mean rays are of all radars
+    if isinstance(rays, MeanRays):  # of all radars
         return first_of(rays, noise)
     first = np.empty(len(rays), np.int32)
-    for rows, own in zip(rays.rows_of_sensors(), noise.of_sensors, strict=True):
+    for rows, own in noise.by_radar(rays):
         first[rows] = first_of(rays.select(rows), own)
     return first

@@ -71,6 +71,10 @@ class SensorNoise:
         """Return the mean (N,) of the variances along the three axes at ranges (N,), m²."""
         return self.variances_m2(ranges_m.astype(np.float64), axes_across=2) / 3
 
+    def by_radar(self, rays: Rays) -> list[tuple[slice | Ints, "SensorNoise"]]:  # noqa: ARG002 - of one radar
+        """Return the rows of the rays of each radar, with its noise."""
+        return [(slice(None), self)]
+
     def weights(self, rays: Rays) -> Ints32 | None:  # noqa: ARG002 - of one radar
         """Return the weight (N,) of each return in parts of 1 / `WEIGHT_UNIT`, relative to the mean of all. None: all equal."""
         return None
@@ -101,6 +105,9 @@ class RigNoise(SensorNoise):
         weights[counts == 0] = 1.0  # a radar of a live map that has not measured yet
         parts = np.maximum(np.rint(WEIGHT_UNIT * weights), 1).astype(int).tolist()
         return cls(mean.range_m, mean.azimuth_rad, mean.elevation_rad, tuple(of_sensors), tuple(parts))
+
+    def by_radar(self, rays: Rays) -> list[tuple[slice | Ints, SensorNoise]]:
+        return [*zip(rays.rows_of_sensors(), self.of_sensors, strict=True)]
 
     def weights(self, rays: Rays) -> Ints32 | None:
         return np.array(self.parts, np.int32)[rays.sensor_of_scan][rays.scans]

@@ -8,7 +8,7 @@ import numpy as np
 from radarsdf.arrays import AnyFloats, ArrayLike, Bools, Bytes, Floats, Floats32, Ints, Ints32, Keys, NDArray
 from radarsdf.checks import check
 from radarsdf.core import cell_rows, find_free_space
-from radarsdf.returns.noise import RigNoise, SensorNoise
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 
@@ -44,8 +44,8 @@ class FreeSpace:
         """Compute the crossings of `rays` to true returns in the box [lower, upper), (2, 3) leaf cells; None for no limit."""
         # Rays end two standard deviations before the return, and where the angular error exceeds one cell: beyond
         # that, the crossed cell is uncertain.
-        end_m, of_sensors = rays.ranges_m.copy(), noise.of_sensors if isinstance(noise, RigNoise) else [noise]
-        for own, rows in zip(of_sensors, rays.rows_of_sensors(), strict=True):
+        end_m = rays.ranges_m.copy()
+        for rows, own in noise.by_radar(rays):
             end_m[rows] -= np.float32(_SIGMAS) * np.sqrt(own.variances_m2(rays.ranges_m[rows]))
             end_m[rows] = np.minimum(end_m[rows], np.float32(leaf_size_m / own.angle_rad))
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
