@@ -23,8 +23,9 @@ pytest.importorskip("cyclonedds", reason="topics of ROS 2 need cyclonedds")
 pytest.importorskip("rosbags")
 from radarsdf.io.bag_messages import POSE_TYPES, TRANSFORM_TYPES, Message, Pose
 from radarsdf.io.bag_poses import Tracks
+from radarsdf.io.dds import Node, make_message
 from radarsdf.io.recordings import Request
-from radarsdf.io.ros2 import Node, Subscription, _RecentTrack, make_message
+from radarsdf.io.subscription import Subscription, _RecentTrack
 
 SCENE = ground_and_wall(scans=12, returns_per_scan=600)
 DOMAIN = 100 + os.getpid() % 100

@@ -15,7 +15,7 @@ from radarsdf.io.bag_messages import BAG_SUFFIXES, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import READERS, read_points
 from radarsdf.io.columns import columns_of
-from radarsdf.io.datasets import DATASETS, find_dataset
+from radarsdf.io.datasets import find_dataset
 from radarsdf.io.npz import read_scans
 from radarsdf.rig import checked_rotation
 from radarsdf.scans import Notes, Scans
@@ -166,7 +166,7 @@ def _read(path: Path, request: recordings.Request) -> Scans:
         return read_bags(bags, request)
     request.refuse(f"{path} is not a bag", *recordings.OF_BAGS)
     if dataset is not None:
-        return DATASETS[dataset][1](path, request)
+        return dataset.read(path, request)
     if path.is_dir():
         files = recordings.cloud_files(path, request.notes)
         return recordings.read_files(files, path, request, partial(recordings.lidar_map, path))
