@@ -144,9 +144,7 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted:
     return whole.mesh(np.zeros(3), limits, leaf_cells)
 
 
-def meshes_of(
-    city: TileBlend, voxel_size: float, progress: bool | None = False, **wanted: Any
-) -> Iterator[Mesh]:
+def meshes_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> Iterator[Mesh]:
     """Yield the mesh of each tile, which may be empty. Small components that reach a border are kept."""
     paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     for path in paths:
