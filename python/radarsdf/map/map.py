@@ -14,7 +14,7 @@ from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Mesh
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, positive, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
-from radarsdf.map.colors import intensity_colors
+from radarsdf.map.colors import Scale
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, confidence, free_space_odds, uncertainty
 from radarsdf.map.threshold import VOXEL_M
 from radarsdf.map.view import DepthImage, View, ViewedMap, view_from
@@ -228,7 +228,7 @@ class Map(ABC):
             return mesh
         values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position).astype(np.float32)
         mesh.vertex_attributes["intensity"] = values
-        mesh.visual.vertex_colors = intensity_colors(values, scale.low, scale.high)
+        mesh.visual.vertex_colors = Scale(scale.low, scale.high)(values)
         return mesh
 
     def render(
