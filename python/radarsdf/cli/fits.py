@@ -54,7 +54,7 @@ def fit(given: Namespace, results: Results) -> None:
     if given.checkpoint is not None:
         given.checkpoint.unlink(missing_ok=True)
     _add_fit(results, radar_map)
-    results.add(f"written to {out}", out=out)
+    results.add_file("map", out)
     words = ["radarsdf", "mesh", str(out), "-o", str(out.with_suffix(".ply"))]
     results.add(f"next: {shlex.join(words)}{' --voxel 0.2' * given.quick}")
     if report is not None:

@@ -159,7 +159,6 @@ def live(given: Namespace, results: Results) -> None:
 
 
 def _recording(given: Namespace) -> tuple[Scans, bool]:
-    """Read the scans; also return whether their poses must be estimated."""
     scans, unposed = scans_or_unposed(given, find=given.find)
     timed = len(scans.points) and (scans.times_s is not None or not unposed)
     check(timed, f"{given.scans}: scans without poses need times, one per scan")
@@ -179,11 +178,11 @@ def _close_and_save(given: Namespace, results: Results, live_map: LiveMap, integ
     if given.out is not None:
         made = live_map.map() if given.quick else live_map.finish(progress=results.progress)
         made.save(given.out)
-        results.add(f"map {given.out}", out=given.out)
+        results.add_file("map", given.out)
     if given.trajectory is not None:
         times_s, poses = (column[-integrated:] for column in live_map.trajectory())
         write_poses(given.trajectory, poses, times_s)
-        results.add(f"trajectory {given.trajectory}", trajectory=given.trajectory)
+        results.add_file("trajectory", given.trajectory, "trajectory")
 
 
 def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> list[Sink]:

@@ -53,7 +53,7 @@ def mesh(given: Namespace, results: Results) -> None:
     results.add_mesh(out, len(found.vertices), len(found.faces), Threshold.of_mesh(found.metadata))
     if drawing is not None:
         picture.save_picture(drawing, found, scalar=found.vertex_attributes.get("intensity"))
-        results.add(f"picture written to {drawing}", picture=drawing)
+        results.add_file("picture", drawing, "picture")
 
 
 def evaluate(given: Namespace, results: Results) -> None:
@@ -177,7 +177,7 @@ def _scans(given: Namespace, radar_map: Map, results: Results) -> tuple[Scans | 
 
 def add_report(results: Results, path: Path, subject: Subject) -> None:
     size = write_report(path, subject)
-    results.add(f"report of {size / 1e6:.1f} MB written to {path}", report=path, report_bytes=size)
+    results.add_file(f"report of {size / 1e6:.1f} MB", path, "report", report_bytes=size)
 
 
 def compare(given: Namespace, results: Results) -> None:
@@ -209,11 +209,11 @@ def compare(given: Namespace, results: Results) -> None:
     edge_m = earlier.config.leaf_size_m
     if out is not None:
         changes.save(out)
-        results.add(f"{out} written", out=out)
+        results.add_file("changes", out)
     if report is not None:
         names = given.map.absolute().name, given.scans.absolute().name
         write_changes_report(report, changes, names, edge_m, regions)
-        results.add(f"{report} written", report=report)
+        results.add_file("report", report, "report")
     if given.view:
         page = ChangesView(changes, regions, edge_m, host=given.host, port=given.port)
         with page, results.until_stopped():
@@ -250,4 +250,4 @@ def grid(given: Namespace, results: Results) -> None:
     words = ", ".join(f"{100 * share:.1f} % {name}" for name, share in shares.items())
     values = {"shape": found.shape, "origin": found.origin, "voxel_size": found.voxel_size}
     results.add(f"{size} voxels of {found.voxel_size:g} m from {origin}: {words}", **values, **shares)
-    results.add(f"wrote {', '.join(map(str, outputs))}", out=outputs)
+    results.add(f"grid written to {', '.join(map(str, outputs))}", out=outputs)

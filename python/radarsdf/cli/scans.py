@@ -64,7 +64,7 @@ def poses(given: Namespace, results: Results) -> None:
         if scans.rig is not None:
             drawn = {name: scans.rig.sensor_poses(poses) for name, poses in drawn.items()}
         save_trajectory_picture(picture, scans.points, drawn)
-        results.add(f"picture written to {picture}", picture=picture)
+        results.add_file("picture", picture, "picture")
 
 
 def check_poses_out(given: Namespace, *others: Path | None) -> None:
