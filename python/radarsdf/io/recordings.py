@@ -249,9 +249,7 @@ def lidar_map(folder: Path) -> Floats | None:
 
 
 def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path], list[float] | None, Poses]:
-    """Sort scans by time; return files, times, s, or None if there are none, and poses."""
-    # Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
-    # file of times.
+    # Poses without times are matched by index, in the order of the times in the names of files, or of a file of times.
     times = times_in([path.stem for path in files], notes)
     listed = None
     if times is None:

@@ -113,8 +113,7 @@ def save_picture(
     mesh : trimesh.Trimesh
         The surface, m, with z up.
     scalar : (V,) array_like, optional
-        A value per vertex, such as its intensity, coloured from the 2nd to the 98th percentile. NaN is grey. None: all of
-        the surface is light grey.
+        A value per vertex, such as its intensity, coloured from the 2nd to the 98th percentile; NaN is light grey. None: all is.
     label : str
         Text of the colour bar, with the unit.
     width, height : int

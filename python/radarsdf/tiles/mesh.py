@@ -184,8 +184,7 @@ def write_tileset(
 ) -> tuple[int, int]:
     """Write ``NAME.json`` and in a folder ``NAME`` a GLB file per tile with triangles.
 
-    GLB files hold float32 relative to the origin of the tile, which is float64 in the JSON: precision does not depend on the
-    distance from the world's origin.
+    GLB files hold float32 relative to the origin of the tile, float64 in the JSON: as precise far from the world's origin.
     """
     folder = path.with_suffix("")
     check_outputs([path])

@@ -29,8 +29,7 @@ class TiledMap(TileBlend):
 
     It has the methods of :class:`Map`. Where tiles overlap, their fields are averaged with weights that fall smoothly to zero,
     so neither surface, gradient nor intensity has a seam. Tiles are read on demand. The voxels of :meth:`mesh` must divide the edge
-    of a leaf cell, so that triangles of adjacent tiles fit together. They are cached in the folder: another mesh of the same
-    `voxel_size` and `box` is fast.
+    of a leaf cell, so that triangles of adjacent tiles fit together. They are cached in the folder by `voxel_size` and `box`.
 
     Parameters
     ----------
