@@ -13,11 +13,10 @@ from radarsdf.arrays import Floats, NDArray
 from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
 from radarsdf.cli import Results
-from radarsdf.cli.inputs import inputs_of, is_map, load_map, mesh_limits, scans_if, split
+from radarsdf.cli.inputs import check_picture, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.scans import add_scans, located, unposed_scans
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics, surface_metrics
-from radarsdf.extras import require
 from radarsdf.grids.grid import DISTANCE_SUFFIXES, save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.bag_messages import is_bag
@@ -46,6 +45,7 @@ def mesh(given: Namespace, results: Results) -> None:
     out, drawing = given.out, given.picture
     checked_suffix(out, MESH_SUFFIXES, "meshes")
     check_outputs([out, drawing], [given.map])
+    check_picture(drawing)
     wanted = mesh_limits(given) | {"box": given.box, "viewpoint": given.viewpoint}
     found = load_map(given.map).mesh(given.voxel, **wanted, progress=results.progress)
     check(len(found.faces), f"{given.map} has no surface here: nothing written")
@@ -228,8 +228,7 @@ def grid(given: Namespace, results: Results) -> None:
         checked_suffix(path, (".npz", ".bt", ".yaml"), "grids")
     checked_suffix(given.distances, DISTANCE_SUFFIXES, "arrays of a grid")
     checked_suffix(given.costmap, (".npz",), "arrays of a grid")
-    if given.picture is not None:
-        require("matplotlib", what="pictures need")
+    check_picture(given.picture)
     pgm = [path.with_suffix(".pgm") for path in flat]
     named = (*out, *pgm, given.distances, given.costmap, given.picture)
     outputs = [path for path in named if path is not None]
