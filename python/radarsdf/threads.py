@@ -34,8 +34,6 @@ if _wanted and _wanted not in _known:  # the core keeps its own choice
 
 
 class _State:
-    """PyTorch's process-wide settings, and who changed them."""
-
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.open_blocks = 0

@@ -87,8 +87,6 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
 
 class _Radars:
-    """Radars of a bag, each with its own topic or frame."""
-
     def __init__(
         self, paths: list[Path], topics: list[Topic], frames: list[str], request: Request, *, partly: bool
     ) -> None:

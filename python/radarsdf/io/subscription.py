@@ -47,8 +47,6 @@ class _RecentTrack(Track):
 
 
 class _Known(NamedTuple):
-    """What is derived from the poses received so far."""
-
     tree: TransformTree
     topic: Track | None  # of the poses, if they are those of a topic
     find: FindPoses
