@@ -227,7 +227,7 @@ def _file(path: Path, frames: int | None) -> Scene:
 
 def _folder(path: Path, frames: int | None) -> Scene:
     scene = _recorded(path.resolve().name, read(path), frames)
-    is_snail_radar = find_dataset(path) == "SNAIL-Radar"
+    is_snail_radar = (dataset := find_dataset(path)) is not None and dataset.name == "SNAIL-Radar"
     return dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M) if is_snail_radar else scene
 
 

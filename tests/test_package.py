@@ -107,14 +107,8 @@ import radarsdf.threads, radarsdf.evaluation
 
 
 def test_the_core_shares_the_openmp_runtime_of_pytorch_and_names_unknown_instruction_sets_once():
-    done = subprocess.run(
-        [sys.executable, "-c", OPENMP],
-        env=os.environ | {"RADARSDF_ISA": "nonsense"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
+    options = {"env": os.environ | {"RADARSDF_ISA": "nonsense"}, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", OPENMP], **options, timeout=60, check=True)
     assert done.stderr.count("RADARSDF_ISA=nonsense is none of baseline") == 1
 
 

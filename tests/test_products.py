@@ -75,14 +75,8 @@ def run_fit(threads):
     names = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
     # Not all kernels of OpenBLAS depend on threads: those of old processors do, and run on all.
     environment = os.environ | dict.fromkeys(names, str(threads)) | {"OPENBLAS_CORETYPE": "Prescott"}
-    done = subprocess.run(
-        [sys.executable, "-c", FIT],
-        env=environment,
-        cwd=Path(__file__).parents[1],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    options = {"cwd": Path(__file__).parents[1], "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", FIT], env=environment, **options, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 

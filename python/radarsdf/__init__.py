@@ -1,7 +1,6 @@
 """From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.
 
-The public names are listed in ``__init__.pyi``. Each is imported at its first use, so that ``import radarsdf`` alone imports
-neither PyTorch nor NumPy.
+``__init__.pyi`` lists the public names, imported at their first use: ``import radarsdf`` alone loads neither PyTorch nor NumPy.
 """
 
 from importlib import import_module

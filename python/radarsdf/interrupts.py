@@ -43,7 +43,6 @@ def terminable() -> Iterator[None]:
 
 
 def _exchange(handler: Any, other: Any, *numbers: signal.Signals) -> None:
-    """Replace the handler of signals, if it is this one."""
     if threading.current_thread() is threading.main_thread():
         for number in numbers or _STOPS:
             if signal.getsignal(number) is handler:

@@ -11,8 +11,7 @@ _PER_BEAM = 100.0
 def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0) -> None:
     """Raise a MemoryError if views of a map exceed the memory.
 
-    `cells`: leaf cells of a map whose surface for views is not yet built; `patches` of that surface; `beams` of one
-    view.
+    `cells`: of a map whose surface for views is not yet built; `patches` of that surface; `beams` of one view.
     """
     needed = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM
     remedy = "use fewer poses or returns, or fit a part of the scans"

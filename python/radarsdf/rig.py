@@ -14,8 +14,7 @@ from radarsdf.checks import are_rigid, check, check_pose, one_for_each_scan, rea
 class Imu:
     """G measurements of an inertial measurement unit, in its own axes.
 
-    Construction raises a ValueError for arrays that are not finite or of inconsistent shapes, times that do not ascend, and an
-    `R_sensor_imu` that is not a rotation.
+    Raises a ValueError for non-finite or inconsistent arrays, descending times, or an `R_sensor_imu` that is no rotation.
     """
 
     times_s: Floats

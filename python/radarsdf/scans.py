@@ -34,8 +34,7 @@ class Scan:
     intensities: Array | None = None
     """(N,) sensor units. None if the sensor does not measure them."""
     doppler_mps: Array | None = None
-    """(N,) radial velocity as output by the sensor, m/s, by most with a negative sign for approaching returns. NaN where it
-    was not measured."""
+    """(N,) radial velocity as output by the sensor, m/s, by most negative for approaching returns; NaN where not measured."""
     time_s: float | None = None
     """Time of the scan, s, by the clock of the file."""
     sigma: Array | None = None
@@ -97,12 +96,10 @@ class Scans:
     """F scans with poses, and optionally lidar points as ground truth.
 
     Iteration yields one :class:`Scan` after another. Scans of :func:`radarsdf.io.read` are read from their files while they
-    are iterated, so memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read all of them
-    and cache them. `poses`, `times_s` and ``len()`` read the files once, and keep no points. The arguments of the constructor
-    have the names, shapes and units of the properties.
+    are iterated, so memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read and cache all.
+    `poses`, `times_s` and ``len()`` read the files once, and keep no points. Arguments of the constructor match the properties.
 
-    Scans of several radars have `sensors`, the label of the radar of each. With their mountings, `T_body_sensor`, poses are
-    those of the body that carries them.
+    Scans of several radars have `sensors`, a label each. With their mountings, `T_body_sensor`, poses are those of the body.
     """
 
     def __init__(

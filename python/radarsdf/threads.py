@@ -34,8 +34,6 @@ if _wanted and _wanted not in _known:  # the core keeps its own choice
 
 
 class _State:
-    """PyTorch's process-wide settings, and who changed them."""
-
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.open_blocks = 0
@@ -133,8 +131,7 @@ class ThreadPool:
         """
         if self.num_threads == 1 or len(items) <= 1:
             return map(function, items)
-        # If every item gets a thread, the calling thread computes the first one itself: sleeping and waking
-        # would take a noticeable part of an iteration.
+        # With a thread for every item, the calling one computes the first: waking another takes a noticeable time.
         own = 0 if len(items) > self.num_threads else 1
         futures = [self._pool.submit(function, item) for item in items[own:]]
         futures.reverse()  # a result is released once it is used

@@ -61,6 +61,7 @@ def test_impossible_meshes_are_rejected(map_file, scans_file, tmp_path, monkeypa
         ([map_file, "-o", "mesh.txt"], "mesh.txt"),
         ([map_file, "-o", "absent/mesh.ply"], "absent"),
         ([map_file, *out, "--picture", "mesh.ply"], "same file"),
+        ([map_file, *out, "--picture", "mesh.jpg"], "mesh.jpg"),
         ([map_file, "-o", "link.ply"], "same file"),
         (["absent.safetensors", *out], "absent.safetensors"),
         ([scans_file, *out], str(scans_file)),

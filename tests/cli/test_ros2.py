@@ -23,8 +23,9 @@ pytest.importorskip("cyclonedds", reason="topics of ROS 2 need cyclonedds")
 pytest.importorskip("rosbags")
 from radarsdf.io.bag_messages import POSE_TYPES, TRANSFORM_TYPES, Message, Pose
 from radarsdf.io.bag_poses import Tracks
+from radarsdf.io.dds import Node, make_message
 from radarsdf.io.recordings import Request
-from radarsdf.io.ros2 import Node, Subscription, _RecentTrack, make_message
+from radarsdf.io.subscription import Subscription, _RecentTrack
 
 SCENE = ground_and_wall(scans=12, returns_per_scan=600)
 DOMAIN = 100 + os.getpid() % 100
@@ -59,20 +60,13 @@ def received(node, readers):
 def test_it_maps_and_publishes(posed, tmp_path, node):
     scans, out, trajectory = (tmp_path / name for name in ("scans.npz", "map.safetensors", "way.npy"))
     write_scans(scans, Scans(SCENE.points, SCENE.poses, SCENE.intensities))
-    talker = [
-        sys.executable,
-        Path(__file__).with_name("ros2_talker.py"),
-        scans,
-        DOMAIN,
-        10,
-        "tf" if posed else "",
-    ]
+    talker = [Path(__file__).with_name("ros2_talker.py"), scans, DOMAIN, 10, "tf" if posed else ""]
     messages, readers, last_m = {}, {}, 10.5 if posed else 5.0  # the drive is 11 m long
     with (
         subprocess.Popen(
             [*LIVE, *FAST, "-o", out, "--trajectory", trajectory], stdout=subprocess.PIPE
         ) as live,
-        subprocess.Popen([str(word) for word in talker]) as talking,
+        subprocess.Popen([sys.executable, *map(str, talker)]) as talking,
     ):
         until_s, seen = time.monotonic() + TIMEOUT_S, False
         try:
@@ -103,10 +97,8 @@ def test_it_maps_and_publishes(posed, tmp_path, node):
     assert {0, 100} <= set(grid.data) <= {-1, 0, 100}
     assert len(grid.data) == grid.info.width * grid.info.height
     child = messages["/tf"][-1].transforms[0]
-    assert (child.header.frame_id, child.child_frame_id) == (
-        world,
-        "radar",
-    )  # one parent: of the talker, or ours
+    frames = child.header.frame_id, child.child_frame_id
+    assert frames == (world, "radar")  # one parent: of the talker, or ours
 
 
 def test_late_static_transforms_replace_an_assumed_mounting():

@@ -170,11 +170,8 @@ class BagWriter:
                 self.make("geometry_msgs/msg/Vector3", *translation),
                 self.make("geometry_msgs/msg/Quaternion", *rotation),
             )
-            stamped.append(
-                self.make(
-                    "geometry_msgs/msg/TransformStamped", self.header(stamp_s, parent), child, transform
-                )
-            )
+            header = self.header(stamp_s, parent)
+            stamped.append(self.make("geometry_msgs/msg/TransformStamped", header, child, transform))
         return self.make("tf2_msgs/msg/TFMessage", stamped)
 
     def _pose(self, matrix: ArrayLike) -> Any:

@@ -116,11 +116,8 @@ def test_radar_msgs(tmp_path, kind):
     with BagWriter(name(tmp_path, kind), kind) as bag:
         odometry(bag)
         for i, time_s in enumerate(TIMES_S):
-            bag.write(
-                "/scan",
-                bag.radar_scan(time_s, [[10, 0, 0, -1, 50], [10, np.pi / 2, 0, 2, 60]][: 1 + i % 2]),
-                time_s,
-            )
+            returns = [[10, 0, 0, -1, 50], [10, np.pi / 2, 0, 2, 60]]
+            bag.write("/scan", bag.radar_scan(time_s, returns[: 1 + i % 2]), time_s)
     scans = list(read(name(tmp_path, kind)))
     assert [len(scan) for scan in scans] == [1, 2, 1, 2, 1]
     assert_allclose(scans[1].points, [[10, 0, 0], [0, 10, 0]], atol=1e-5)

@@ -71,7 +71,7 @@ def coloradar(tmp_path):
 
 
 def test_coloradar(coloradar):
-    assert find_dataset(coloradar) == "ColoRadar"
+    assert find_dataset(coloradar).name == "ColoRadar"
     check(read(coloradar), POSES @ MOUNTING)
     check(read(coloradar, extrinsic=np.eye(4)), POSES)
     check(read(coloradar, POSES), POSES @ MOUNTING)
@@ -113,7 +113,7 @@ def delft(tmp_path):
 
 def test_view_of_delft(delft):
     for folder in (delft, delft / "radar"):
-        assert find_dataset(folder) == "View-of-Delft"
+        assert find_dataset(folder).name == "View-of-Delft"
         check(read(folder), POSES, None)
     check(read(delft, POSES), POSES, None)
     np.zeros((1, 7), "<f4").tofile(delft / "radar" / "training" / "velodyne" / "00999.bin")
@@ -135,7 +135,7 @@ def test_msc_rad4r(tmp_path):
         )
     lines = [f"{i} {int(t)} {round((t - int(t)) * 1e9)}\n" for i, t in enumerate(TIMES_S)]
     (folder / "3_RADAR" / "timestamp_radar.txt").write_text("".join(lines))
-    assert find_dataset(folder) == "MSC-RAD4R"
+    assert find_dataset(folder).name == "MSC-RAD4R"
     with pytest.raises(ValueError, match="has no poses"):
         read(folder)
     (tmp_path / "odometry.tum").write_text(tum_rows())

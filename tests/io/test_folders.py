@@ -108,14 +108,8 @@ def snail(tmp_path):
     (clouds / "times.txt").write_text("0\n")
     # Left, back, up are west, south, up: half a turn about z.
     facing_north = (0, 0, 1, 0)
-    write_poses(
-        folder / "utm50r_T_xt32.txt",
-        [
-            (0.0, UTM, facing_north),
-            (0.2, UTM + [0.5, 0, 0], facing_north),
-            (0.4, UTM + [1, 0, 0], facing_north),
-        ],
-    )
+    eastwards = [(0.2 * i, UTM + [0.5 * i, 0, 0], facing_north) for i in range(3)]
+    write_poses(folder / "utm50r_T_xt32.txt", eastwards)
     return folder
 
 

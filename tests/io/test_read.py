@@ -116,10 +116,12 @@ def test_what_is_not_finite_is_dropped_and_counted(tmp_path, caplog):
 
 def test_what_cannot_be_read_is_named(tmp_path):
     clouds(tmp_path / "scans", 3)
+    (tmp_path / "empty").mkdir()
     (tmp_path / "scans.h5").write_bytes(b"HDF")
     (tmp_path / "poses.tum").write_text("".join(f"{t} 0 0 0 0 0 0 1\n" for t in range(3)))
     for path, poses, error, names in (
         (tmp_path / "scans", POSES[:2], ValueError, "3 scans but 2 poses"),
+        (tmp_path / "empty", POSES[:2], ValueError, "empty holds no scans"),
         (tmp_path / "nowhere", POSES[:2], FileNotFoundError, "nowhere does not exist"),
         (tmp_path / "scans", tmp_path / "poses.txt", FileNotFoundError, r"poses\.txt does not exist"),
         (tmp_path / "scans.h5", POSES[:2], ValueError, r"scans\.h5 is of no kind"),

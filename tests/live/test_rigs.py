@@ -28,15 +28,8 @@ def three_at_20_hz(drive, frames, apart_s=0.0):
 
 
 def integrate(live, scans, i, pose=None):
-    return live.integrate(
-        scans.points[i],
-        pose,
-        scans.intensities[i],
-        doppler_mps=scans.doppler_mps[i],
-        time_s=scans.times_s[i],
-        sensor=scans.sensors[i],
-        scan_id=i,
-    )
+    known = {"doppler_mps": scans.doppler_mps[i], "time_s": scans.times_s[i], "sensor": scans.sensors[i]}
+    return live.integrate(scans.points[i], pose, scans.intensities[i], **known, scan_id=i)
 
 
 def test_scans_at_poses_of_the_body_are_those_of_a_fit(scans, tmp_path):

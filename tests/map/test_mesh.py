@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf._core import mesh_components
-from radarsdf.map.colors import intensity_colors
+from radarsdf.map.colors import Scale
 from radarsdf.map.mesh import _corner_distances, crossed
 from radarsdf.map.radar_map import RadarMap
 from scipy.spatial import KDTree
@@ -133,8 +133,9 @@ def test_a_viewpoint_gives_intensities_and_colours(sharp_map, mesh):
     intensity = seen.vertex_attributes["intensity"]
     np.testing.assert_allclose(intensity, sharp_map.intensity(np.asarray(seen.vertices), SENSOR), atol=1e-4)
     scale = sharp_map.intensity_scale
-    expected = intensity_colors(intensity, scale.low, scale.high)
-    np.testing.assert_array_equal(seen.visual.vertex_colors, expected)
+    expected = Scale(scale.low, scale.high)(intensity)
+    opaque = np.pad(expected, ((0, 0), (0, 1)), constant_values=255)
+    np.testing.assert_array_equal(seen.visual.vertex_colors, opaque)
     x, _, z = seen.vertices.T
     on_wall = (np.abs(x - 20) < 0.1) & (z > 1) & (z < 3)
     expected = 100 - 40 * np.log10(np.linalg.norm(seen.vertices[on_wall] - SENSOR, axis=1))

@@ -44,15 +44,8 @@ def write(path, tensors, metadata):
 @pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
 @pytest.mark.parametrize("with_intensity", [True, False])
 def test_a_loaded_map_is_bit_identical(scene, tmp_path, encoding, with_intensity):
-    before = fitted(
-        scene,
-        with_intensity=with_intensity,
-        kind=encoding,
-        normals=True,
-        geometry_feature_dim=4,
-        intensity_hidden=(16,),
-        max_range_m=70.0,
-    )
+    networks = {"normals": True, "geometry_feature_dim": 4, "intensity_hidden": (16,)}
+    before = fitted(scene, with_intensity=with_intensity, kind=encoding, max_range_m=70.0, **networks)
     path = tmp_path / "map.safetensors"
     before.save(path)
     after = radarsdf.load(path)

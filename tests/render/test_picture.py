@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.map.colors import intensity_colors
+from radarsdf.map.colors import Scale
 from radarsdf.render.picture import render, save_picture
 
 WHITE = np.array([255, 255, 255])
@@ -27,16 +27,13 @@ def one_color(mesh, color):
 
 
 def test_color_map_limits_and_nan():
-    c = intensity_colors([-5.0, 45.0, 73.5, 102.0, 500.0, np.inf, np.nan], 45.0, 102.0)
+    c = Scale(45.0, 102.0)([-5.0, 45.0, 73.5, 102.0, 500.0, np.inf, np.nan])
     assert (c[0] == c[1]).all()
     assert (c[3] == c[4]).all()
     assert (c[3] == c[5]).all()
     assert len({tuple(row) for row in c.tolist()}) == 4  # low, middle, high, unknown
-    assert np.ptp(c[6, :3]) < 20  # grey
-    np.testing.assert_array_equal(intensity_colors([7.0], 7.0, 7.0), intensity_colors([0.5], 0.0, 1.0))
-    for low, high in ((1.0, 0.0), (np.nan, 1.0)):
-        with pytest.raises(ValueError, match="limits"):
-            intensity_colors([0.5], low, high)
+    assert np.ptp(c[6]) < 20  # grey
+    np.testing.assert_array_equal(Scale(7.0, 7.0)([7.0]), Scale(0.0, 1.0)([0.5]))
 
 
 @pytest.mark.parametrize("cells", [1, 7, 150])
@@ -113,7 +110,7 @@ def test_save_picture_has_the_colors_of_the_scalar(tmp_path):
     )
     image = np.rint(imread(path)[..., :3] * 255)
     assert image.shape == (300, 500, 3)
-    low, high = intensity_colors([60.0, 80.0], 60.0, 80.0)[:, :3].astype(float)
+    low, high = Scale(60.0, 80.0)([60.0, 80.0]).astype(float)
     for column, color in ((150, low), (300, high)):
         shade = image[150, column] / color
         assert np.ptp(shade) < 0.06  # the colour, darker or brighter by the light

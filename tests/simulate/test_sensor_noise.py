@@ -96,14 +96,8 @@ def test_phantoms_lie_behind_surfaces_at_depths_that_grow_with_the_range():
 )  # fmt: skip
 def test_persistent_phantoms_are_fixed_in_the_world(share, seed, least, most):
     """In all scans, independent of the pose. Another seed has other positions."""
-    sensor = replace(
-        QUIET,
-        azimuth_fov_rad=1.0,
-        elevation_fov_rad=0.7,
-        phantoms_per_scan=2000.0,
-        phantom_lasting_share=share,
-        phantom_depth=0.02,
-    )
+    many = {"phantoms_per_scan": 2000.0, "phantom_lasting_share": share, "phantom_depth": 0.02}
+    sensor = replace(QUIET, azimuth_fov_rad=1.0, elevation_fov_rad=0.7, **many)
     there = np.eye(4)
     there[:3, 3] = [1.0, 0.3, -0.2]
     scene = wall_ahead(30.0)

@@ -24,15 +24,8 @@ def cluster(tmp_path_factory):
 
 def test_fits_on_a_cluster_change_no_bit(cluster, drive, folder, tmp_path):
     with cluster_executor(cluster.address, 0) as executor:
-        city = radarsdf.fit_tiles(
-            drive,
-            tmp_path / "city",
-            tile_size=TILE_M,
-            halo=6.4,
-            executor=executor,
-            config=CONFIG,
-            progress=False,
-        )
+        options = {"tile_size": TILE_M, "halo": 6.4, "executor": executor, "config": CONFIG}
+        city = radarsdf.fit_tiles(drive, tmp_path / "city", **options, progress=False)
     assert city.missing == {}
     assert bits_of(tmp_path / "city") == bits_of(folder)
 

@@ -12,6 +12,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Scan
 from radarsdf.io.files import take_lock
+from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, map_path
 
@@ -32,17 +33,9 @@ def test_one_tile_equals_one_fit(drive, tmp_path):
     assert len(contents) == 2  # the drive crosses a border, and each tile has the returns within 51 m
     part = contents[0, 0]
     scale = (city.intensity_scale.low, city.intensity_scale.high)
-    known = {
-        name: getattr(city.config.returns, name)
-        for name in ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
-    }
-    whole = radarsdf.fit(
-        drive,
-        config=CONFIG.override(returns=known),
-        origin=part.origin,
-        intensity_range=scale,
-        progress=False,
-    )
+    config = CONFIG.override(returns={name: getattr(city.config.returns, name) for name in NOISE_SETTINGS})
+    given = {"origin": part.origin, "intensity_range": scale}
+    whole = radarsdf.fit(drive, config=config, **given, progress=False)
     np.testing.assert_array_equal(whole.field.table.leaf_keys(), part.field.table.leaf_keys())
     np.testing.assert_array_equal(whole.evidence.visibility, part.evidence.visibility)
     points = np.concatenate([s.world_points for s in drive])[::50]

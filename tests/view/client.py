@@ -96,13 +96,8 @@ class PlainClient:
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     def move_sensor(self, position: tuple[float, float, float]) -> None:
-        self.send(
-            "TransformControlsUpdateMessage",
-            name="/sensor",
-            wxyz=(1.0, 0.0, 0.0, 0.0),
-            position=position,
-            owner="",
-        )
+        pose: dict[str, Any] = {"position": position, "wxyz": (1.0, 0.0, 0.0, 0.0)}
+        self.send("TransformControlsUpdateMessage", name="/sensor", **pose, owner="")
 
     def drag(self, seconds: float) -> tuple[float, float]:
         began_s = time.perf_counter()

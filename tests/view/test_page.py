@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from radarsdf.io import Scans
-from radarsdf.map.colors import intensity_colors
+from radarsdf.map.colors import SHARES
 from radarsdf.view.pages import Viewer
 from radarsdf.view.surface import shaded
 from scipy.spatial import cKDTree
@@ -56,7 +56,7 @@ def test_a_drag_and_a_click(sharp_map, scene):
 
 def _of_scale(pixels):
     """Whether each colour (N, 3) is on the scale, up to shading."""
-    scale = intensity_colors(np.linspace(0, 1, 256), 0, 1)[:, :3]
+    scale = SHARES(np.linspace(0, 1, 256))
     shades = np.concatenate([shaded(scale, np.full(256, factor)) for factor in np.linspace(0.87, 1, 8)])
     return cKDTree(shades.astype(float)).query(pixels.astype(float))[0] < 6
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import Scans
-from radarsdf.map.colors import intensity_colors
+from radarsdf.map.colors import Scale
 from radarsdf.view.pages import Viewer
 from radarsdf.view.serving import start_server
 from radarsdf.view.surface import shaded
@@ -178,7 +178,7 @@ def test_the_surface_is_coloured_by_the_chosen_quantity(client, viewer):
         legend = content(client.wait_for(lambda m, name=name: name in content(m), before))
         assert all(f">{limit:.3g}<" in legend for limit in limits)
         shown = mesh_of(client.wait_for(is_mesh, before)).colors
-        expected = shaded(intensity_colors(values, *limits)[:, :3], surface.lightness)
+        expected = shaded(Scale(*limits)(values), surface.lightness)
         np.testing.assert_allclose(shown, expected, atol=1)
     before = len(client.received())
     slide(client, "colour by", "intensity")

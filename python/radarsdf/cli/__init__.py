@@ -26,8 +26,7 @@ _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command, by default of ``sys.argv``, and return the exit status. An error is printed as one line on standard error.
 
-    The status is 0 on success, 1 if the command failed or a check found an error, 2 if the command line is wrong, 130 if
-    Ctrl-C or SIGTERM stopped it.
+    The status is 0 on success, 1 after an error or if a check found one, 2 for wrong usage, 130 after Ctrl-C or SIGTERM.
     """
     # A character that the terminal cannot encode must not discard the results so far.
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -123,8 +122,8 @@ class Results:
         self.add_file(line, path, vertices=vertices, triangles=triangles)
         self.add(str(threshold), **vars(threshold))
 
-    def add_file(self, what: str, path: Path, **values: Any) -> None:
-        self.add(f"{what} written to {path}", out=path, **values)
+    def add_file(self, what: str, path: Path, key: str = "out", **values: Any) -> None:
+        self.add(f"{what} written to {path}", **{key: path}, **values)
 
     def end(self) -> None:
         """Print the JSON object, if there is one. Non-finite numbers become null."""

@@ -54,7 +54,7 @@ def fit(given: Namespace, results: Results) -> None:
     if given.checkpoint is not None:
         given.checkpoint.unlink(missing_ok=True)
     _add_fit(results, radar_map)
-    results.add(f"written to {out}", out=out)
+    results.add_file("map", out)
     words = ["radarsdf", "mesh", str(out), "-o", str(out.with_suffix(".ply"))]
     results.add(f"next: {shlex.join(words)}{' --voxel 0.2' * given.quick}")
     if report is not None:
@@ -80,7 +80,9 @@ def _add_fit(results: Results, radar_map: radarsdf.RadarMap) -> None:
     loss = "".join(f", {stage} loss {value:.3g}" for stage, value in losses.items())
     results.add(f"fit {seconds:.1f} s: {radar_map}{loss}", seconds=seconds, losses=losses)
     angles = ", ".join(f"{axis} {noise[f'{axis}_rad']:.4f} rad" for axis in ("azimuth", "elevation"))
-    results.add(f"noise {noise['range_m']:.3f} m, {angles}", noise=noise, map_bytes=radar_map.file_bytes)
+    results.add(
+        f"noise: range {noise['range_m']:.3f} m, {angles}", noise=noise, map_bytes=radar_map.file_bytes
+    )
 
 
 def demo(given: Namespace, results: Results) -> None:

@@ -11,7 +11,9 @@ from radarsdf.checks import check_pose
 from radarsdf.cli import warn
 from radarsdf.cli.options import GROUPS, LIMITS, refuse_if
 from radarsdf.evaluation import holdout
+from radarsdf.extras import require
 from radarsdf.io.columns import read_numbers
+from radarsdf.io.files import checked_suffix
 from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
 from radarsdf.io.recordings import Request
@@ -125,6 +127,13 @@ def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
 def inputs_of(given: Namespace) -> list[Path | None]:
     """The input files and folders, which no output may overwrite."""
     return [vars(given).get("map"), given.scans, given.poses, given.extrinsic, given.imu_rotation]
+
+
+def check_picture(path: Path | None) -> None:
+    """Raise, before the work, unless a picture, if any, can be drawn."""
+    checked_suffix(path, (".png",), "pictures")
+    if path is not None:
+        require("matplotlib", what="pictures need")
 
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -19,9 +20,10 @@ from radarsdf.cli.options import refuse_if
 from radarsdf.cli.settings import load_config
 from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.interrupts import deferred_interrupts
+from radarsdf.io.dds import Node
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
-from radarsdf.io.ros2 import Node, Subscription
+from radarsdf.io.subscription import Subscription
 from radarsdf.live.live_map import Integrated, LiveMap
 from radarsdf.live.store import ScanId
 from radarsdf.poses.search import Lost
@@ -118,40 +120,29 @@ def _due(scans: Scans, rate: float, done: Replay, stopped: Callable[[], bool]) -
 
 def live(given: Namespace, results: Results) -> None:
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
-    request = request_of_topics(given)
-    out, trajectory = given.out, given.trajectory
-    checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
-    check_outputs([out, trajectory, given.mcap, given.rrd], inputs_of(given))
+    request, begin = request_of_topics(given), given.map
+    changed = begin and (given.config or given.set or given.paper)
+    refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
+    checked_suffix(given.trajectory, POSE_SUFFIXES, "poses to write")
+    check_outputs([given.out, given.trajectory, given.mcap, given.rrd], inputs_of(given))
     with ExitStack() as servers, ExitStack() as files:
         sinks = _opened_sinks(given, servers, files)
         urls = [sink.url for sink in sinks if sink.url]
-        begin = given.map
-        changed = begin and (given.config or given.set or given.paper)
-        refuse_if(changed, f"settings are those of the map {begin}: leave out --config, --set and --paper")
         scans: Scans | Subscription
-        folder = None
         if request is None:
-            scans, unposed = scans_or_unposed(given, find=given.find)
-            timed = len(scans.points) and (scans.times_s is not None or not unposed)
-            check(timed, f"{given.scans}: scans without poses need times, one per scan")
-            check_pose_times(trajectory, scans.times_s)
-        else:
-            # Of the scans of hours of driving, memory holds only the last ones. /tmp may be memory.
-            parent = None if out is None else out.absolute().parent
-            temporary = TemporaryDirectory(prefix="radarsdf-", dir=parent, ignore_cleanup_errors=True)
-            folder = servers.enter_context(temporary)
+            scans, unposed = _recording(given)
         with deferred_interrupts() as stopped:
             if request is not None:
                 node = servers.enter_context(closing(Node(given.ros2_domain, given.host)))
                 scans = Subscription(node, given.ros2, request, given.find, stopped, warn)
-                sinks, unposed = [*sinks, Ros2Sink(node, scans)], scans.unposed
+                sinks, unposed = [*sinks, Ros2Sink(scans)], scans.unposed
                 topics = ", ".join(given.ros2)
                 results.add(f"{topics} mapped, the map published as /radarsdf/…; Ctrl-C ends it")
-            growing = (
-                LiveMap.load(begin, folder=folder)
-                if begin
-                else LiveMap(load_config(given), folder=folder, T_body_sensor=scans.T_body_sensor)
-            )
+            folder = None if request is None else servers.enter_context(_folder_near(given.out))
+            if begin is None:
+                growing = LiveMap(load_config(given), folder=folder, T_body_sensor=scans.T_body_sensor)
+            else:
+                growing = LiveMap.load(begin, folder=folder)
             if urls:
                 results.say(f"live map on {' and '.join(urls)}; Ctrl-C ends it")
             shown = _Shown(growing, scans.T_body_sensor, sinks) if sinks else None
@@ -167,17 +158,31 @@ def live(given: Namespace, results: Results) -> None:
                 wait()
 
 
+def _recording(given: Namespace) -> tuple[Scans, bool]:
+    scans, unposed = scans_or_unposed(given, find=given.find)
+    timed = len(scans.points) and (scans.times_s is not None or not unposed)
+    check(timed, f"{given.scans}: scans without poses need times, one per scan")
+    check_pose_times(given.trajectory, scans.times_s)
+    return scans, unposed
+
+
+def _folder_near(out: Path | None) -> TemporaryDirectory[str]:
+    """Create a folder for the scans of hours of driving, of which memory holds only the last ones. /tmp may be memory."""
+    parent = None if out is None else out.absolute().parent
+    return TemporaryDirectory(prefix="radarsdf-", dir=parent, ignore_cleanup_errors=True)
+
+
 def _close_and_save(given: Namespace, results: Results, live_map: LiveMap, integrated: int) -> None:
     if not live_map.sealed_scans and len(live_map.close_loops()):
         results.add("loops of the trajectory closed")
     if given.out is not None:
         made = live_map.map() if given.quick else live_map.finish(progress=results.progress)
         made.save(given.out)
-        results.add(f"map {given.out}", out=given.out)
+        results.add_file("map", given.out)
     if given.trajectory is not None:
         times_s, poses = (column[-integrated:] for column in live_map.trajectory())
         write_poses(given.trajectory, poses, times_s)
-        results.add(f"trajectory {given.trajectory}", trajectory=given.trajectory)
+        results.add_file("trajectory", given.trajectory, "trajectory")
 
 
 def _opened_sinks(given: Namespace, servers: ExitStack, files: ExitStack) -> list[Sink]:
@@ -247,7 +252,7 @@ def _add_replay(results: Results, done: Replay) -> None:
     counts = {"scans": done.integrated, "dropped": done.dropped, "lost": done.lost}
     results.add("\n".join([line, *done.notes]), **counts, notes=done.notes)
     hertz = len(done.seconds) / max(sum(done.seconds), 1e-9)
-    values = dict(zip(("p50_s", "p99_s", "worst_s"), np.percentile(done.seconds, [50, 99, 100]), strict=True))
-    named = zip(("median", "99th percentile", "worst"), values.values(), strict=True)
-    took = ", ".join(f"{1e3 * took_s:.1f} ms ({name})" for name, took_s in named)
-    results.add(f"a scan took {took}: {hertz:.0f} scans per second", **values, scans_per_second=hertz)
+    p50_s, p99_s, worst_s = np.percentile(done.seconds, [50, 99, 100])
+    took = f"{1e3 * p50_s:.1f} ms (median), {1e3 * p99_s:.1f} ms (99th percentile), {1e3 * worst_s:.1f} ms (worst)"
+    values = {"p50_s": p50_s, "p99_s": p99_s, "worst_s": worst_s, "scans_per_second": hertz}
+    results.add(f"a scan took {took}: {hertz:.0f} scans per second", **values)

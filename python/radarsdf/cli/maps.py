@@ -13,11 +13,10 @@ from radarsdf.arrays import Floats, NDArray
 from radarsdf.changes.changes import compare as compare_maps
 from radarsdf.checks import check
 from radarsdf.cli import Results
-from radarsdf.cli.inputs import inputs_of, is_map, load_map, mesh_limits, scans_if, split
+from radarsdf.cli.inputs import check_picture, inputs_of, is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.scans import add_scans, located, unposed_scans
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics, surface_metrics
-from radarsdf.extras import require
 from radarsdf.grids.grid import DISTANCE_SUFFIXES, save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.bag_messages import is_bag
@@ -46,6 +45,7 @@ def mesh(given: Namespace, results: Results) -> None:
     out, drawing = given.out, given.picture
     checked_suffix(out, MESH_SUFFIXES, "meshes")
     check_outputs([out, drawing], [given.map])
+    check_picture(drawing)
     wanted = mesh_limits(given) | {"box": given.box, "viewpoint": given.viewpoint}
     found = load_map(given.map).mesh(given.voxel, **wanted, progress=results.progress)
     check(len(found.faces), f"{given.map} has no surface here: nothing written")
@@ -53,7 +53,7 @@ def mesh(given: Namespace, results: Results) -> None:
     results.add_mesh(out, len(found.vertices), len(found.faces), Threshold.of_mesh(found.metadata))
     if drawing is not None:
         picture.save_picture(drawing, found, scalar=found.vertex_attributes.get("intensity"))
-        results.add(f"picture written to {drawing}", picture=drawing)
+        results.add_file("picture", drawing, "picture")
 
 
 def evaluate(given: Namespace, results: Results) -> None:
@@ -177,7 +177,7 @@ def _scans(given: Namespace, radar_map: Map, results: Results) -> tuple[Scans | 
 
 def add_report(results: Results, path: Path, subject: Subject) -> None:
     size = write_report(path, subject)
-    results.add(f"report of {size / 1e6:.1f} MB written to {path}", report=path, report_bytes=size)
+    results.add_file(f"report of {size / 1e6:.1f} MB", path, "report", report_bytes=size)
 
 
 def compare(given: Namespace, results: Results) -> None:
@@ -209,11 +209,11 @@ def compare(given: Namespace, results: Results) -> None:
     edge_m = earlier.config.leaf_size_m
     if out is not None:
         changes.save(out)
-        results.add(f"{out} written", out=out)
+        results.add_file("changes", out)
     if report is not None:
         names = given.map.absolute().name, given.scans.absolute().name
         write_changes_report(report, changes, names, edge_m, regions)
-        results.add(f"{report} written", report=report)
+        results.add_file("report", report, "report")
     if given.view:
         page = ChangesView(changes, regions, edge_m, host=given.host, port=given.port)
         with page, results.until_stopped():
@@ -228,8 +228,7 @@ def grid(given: Namespace, results: Results) -> None:
         checked_suffix(path, (".npz", ".bt", ".yaml"), "grids")
     checked_suffix(given.distances, DISTANCE_SUFFIXES, "arrays of a grid")
     checked_suffix(given.costmap, (".npz",), "arrays of a grid")
-    if given.picture is not None:
-        require("matplotlib", what="pictures need")
+    check_picture(given.picture)
     pgm = [path.with_suffix(".pgm") for path in flat]
     named = (*out, *pgm, given.distances, given.costmap, given.picture)
     outputs = [path for path in named if path is not None]
@@ -250,4 +249,4 @@ def grid(given: Namespace, results: Results) -> None:
     words = ", ".join(f"{100 * share:.1f} % {name}" for name, share in shares.items())
     values = {"shape": found.shape, "origin": found.origin, "voxel_size": found.voxel_size}
     results.add(f"{size} voxels of {found.voxel_size:g} m from {origin}: {words}", **values, **shares)
-    results.add(f"wrote {', '.join(map(str, outputs))}", out=outputs)
+    results.add(f"grid written to {', '.join(map(str, outputs))}", out=outputs)

@@ -85,6 +85,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "convert scans": (_PATH, "the scans, as for radarsdf fit; or a mesh: .ply, .obj, .off, .stl, .glb"),
     "sessions": (_PATH | {"nargs": "+", "metavar": "scans"}, "the sessions, as the scans of radarsdf fit; the first one's frame is kept"),
     "poses": (_MAYBE, "file of poses, if the scans have none: TUM, KITTI, 4 x 4 matrices"),
+    "locate poses": (_MAYBE, argparse.SUPPRESS),  # refused
     "--extrinsic": (_FILE, "T_base_sensor, 4 x 4, if the poses are those of another frame than the sensor's"),
     "--topic": (_NAMES, "in a bag: the topic of the scans; may be repeated"),
     "--pose-topic": (_NAME, "in a bag: the topic of the poses"),

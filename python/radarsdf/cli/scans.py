@@ -13,10 +13,9 @@ from radarsdf.arrays import Floats
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
 from radarsdf.cli import Results, as_json, warn
-from radarsdf.cli.inputs import inputs_of, load_map, read_scans, scans_if, scans_or_unposed
+from radarsdf.cli.inputs import check_picture, inputs_of, load_map, read_scans, scans_if, scans_or_unposed
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.settings import load_config
-from radarsdf.extras import require
 from radarsdf.io.clouds import CLOUD_OUT_SUFFIXES, CLOUD_SUFFIXES, write_cloud
 from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 from radarsdf.io.meshes import MESH_SUFFIXES, holds_mesh, read_mesh, write_mesh
@@ -51,8 +50,7 @@ def poses(given: Namespace, results: Results) -> None:
     out, picture = given.out, given.picture
     refuse_if(given.find and given.poses, f"--find does not use poses: leave out {given.poses}")
     check_poses_out(given, picture)
-    if picture is not None:
-        require("matplotlib", what="pictures need")
+    check_picture(picture)
     config = load_config(given)
     scans, unposed = scans_or_unposed(given, find=given.find)
     check_pose_times(out, scans.times_s)
@@ -64,7 +62,7 @@ def poses(given: Namespace, results: Results) -> None:
         if scans.rig is not None:
             drawn = {name: scans.rig.sensor_poses(poses) for name, poses in drawn.items()}
         save_trajectory_picture(picture, scans.points, drawn)
-        results.add(f"picture written to {picture}", picture=picture)
+        results.add_file("picture", picture, "picture")
 
 
 def check_poses_out(given: Namespace, *others: Path | None) -> None:

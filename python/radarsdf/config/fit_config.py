@@ -152,8 +152,7 @@ class FitConfig:
 
     def moves_rows(self, with_intensity: bool) -> bool:
         """Whether an iteration updates only the features that its samples use."""
-        # Normals are gradients of the features: only autograd differentiates them again, and it updates all
-        # features at once.
+        # Normals are gradients of the features: only autograd differentiates them again, and it updates all at once.
         through_normals = with_intensity and self.networks.normals
         return self.training.optimiser == "soap" and not through_normals
 

@@ -2,8 +2,7 @@
 
 "3QFP" (ICRA 2024) and "3QFPI" (Neural Surface and Reflectance Modelling from 3D Radar Data) are the papers
 and their published settings for radar. "Measured" means measured on simulated and real scans;
-``docs/defaults.md`` lists the gains. Lengths that end in ``_cells`` are in leaf cells: for a scene of another scale, only
-`leaf_size_m` has to change.
+``docs/defaults.md`` lists the gains. Lengths that end in ``_cells`` are in leaf cells, so they scale with `leaf_size_m`.
 """
 
 from typing import Annotated, Literal
@@ -45,9 +44,8 @@ class ReturnsConfig:
     """Number of consecutive scans treated as seen from the position of the middle one (3QFPI: 5, since it
     trains scan by scan). 1 is enough here: a fit trains on all scans at once."""
     drop_moving: bool = True
-    """Whether to drop returns whose Doppler velocity, if there is one, contradicts a static world (3QFPI:
-    no). Measured: 0.1 to 8.6 points of F-score on five real drives, 5.9 on a simulated street with cars, 0.0 on one
-    without."""
+    """Whether to drop returns whose Doppler velocity, if measured, contradicts a static world (3QFPI: no). Measured:
+    0.1 to 8.6 points of F-score on five real drives, 5.9 on a simulated street with cars, 0.0 on one without."""
     drop_ghosts: bool = True
     """Whether to fit the surface without ghosts: returns behind a surface that their rays crossed, such as
     reflections in mirrors (3QFPI: no). Measured on twelve kinds of simulated scenes: it removes half to three quarters of
@@ -65,9 +63,8 @@ class ReturnsConfig:
     pose_sigma_rad: Annotated[float, Field(ge=0, le=_MAX_NOISE_RAD)] = 0.0
     """Standard deviation of the orientation of a scan, rad. It displaces a return in proportion to its range."""
     onto_planes: bool = True
-    """Whether to move each return towards the surfel of its cell, a plane through the returns there, if there
-    is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
-    up to 1 % more error of intensities."""
+    """Whether to move each return towards the surfel of its cell, a plane through the returns there (3QFPI: no). Measured:
+    0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones; up to 1 % more error of intensities."""
     free_space: bool = True
     """Whether the map provides free-space crossings, and mean intensities by place and view, for :func:`radarsdf.grid` and
     :func:`radarsdf.compare`. They are computed on first use or on saving, in 1 to 5 µs of CPU time per return; until then
@@ -85,10 +82,9 @@ class EncodingConfig:
     kind: Literal["tri-quadtree", "octree"] = "tri-quadtree"
     """Where the features are: on quadtrees in three planes (3QFP) or on an octree (SHINE-Mapping)."""
     bridge_cells: Annotated[int, Field(ge=0, le=_MAX_BRIDGE_CELLS)] = 4
-    """Gaps of at most this many empty leaf cells between two cells with returns become part of the map (3QFP:
-    0). Four are as wide as a cell of the third level, so its features interpolate across the gap. Measured:
-    0.8 to 3.8 points of F-score on every tenth scan of a scene, 0.5 and 0.8 on real scans, 0.0 to -0.2 on
-    whole simulated scenes."""
+    """Gaps of at most this many empty leaf cells between two cells with returns become part of the map (3QFP: 0). Four are
+    as wide as a cell of the third level, so its features interpolate across the gap. Measured: 0.8 to 3.8 points of
+    F-score on every tenth scan of a scene, 0.5 and 0.8 on real scans, 0.0 to -0.2 on whole simulated scenes."""
     fourier_count: Annotated[int, Field(ge=0, le=MAX_FREQUENCIES)] = 10
     """Number of Fourier frequencies (3QFP: 16). The tenth has a wavelength of 8 leaf cells, twice the edge of
     the coarsest cells; details inside these are left to the features. Shorter wavelengths fit the noise."""
@@ -127,18 +123,16 @@ class TrainingConfig:
     """Losses, schedule and optimiser."""
 
     sigma_cells: _Positive = 0.5
-    """Scale of the sigmoid from signed distance to occupancy, in leaf cells (3QFP: 0.0275 m). Measured: 0.4
-    to 0.75 differ by 0.2 points of F-score on simulated scenes; on real ones 0.4 to 0.5 are 0.4 to 2 points
-    better."""
+    """Scale of the sigmoid from signed distance to occupancy, in leaf cells (3QFP: 0.0275 m). Measured: 0.4 to 0.75 differ
+    by 0.2 points of F-score on simulated scenes; 0.4 to 0.5 are 0.4 to 2 points better on real ones."""
     intensity_in_free_space: bool = False
     """Whether the intensity network also trains on samples in free space, with the lowest intensity as their
     label (3QFPI: yes). Measured: 10 to 25 % more error."""
     batch_size: Annotated[int, Field(ge=1, le=MAX_SAMPLES)] = 4096
     """Samples in an iteration of the sdf stage (3QFP: 8192). Measured: more, smaller steps are better."""
     intensity_batch_size: Annotated[int, Field(ge=1, le=MAX_SAMPLES)] = 1024
-    """Samples of the intensity network in an iteration, unless it sees free space in the sdf stage (3QFPI:
-    8192). Measured: more, smaller steps are better; 2048 take 1.5 to 1.8 times as long, for 0.3 to 0.7 % less error on simulated
-    scenes."""
+    """Samples of the intensity network in an iteration, unless it sees free space in the sdf stage (3QFPI: 8192). Measured:
+    more, smaller steps are better; 2048 take 1.5 to 1.8 times as long, for 0.3 to 0.7 % less error on simulated scenes."""
     sdf_iterations: _Count | None = None
     """Iterations of the sdf stage. It trains features and SDF network, which are then frozen (3QFPI: 1000).
     None: from the size of the data and `effort`."""
@@ -153,8 +147,7 @@ class TrainingConfig:
     that decay to zero along a cosine in each stage. `"adam"`: Adam for all, with constant learning rates (3QFPI). Measured: with
     SOAP, the networks need a quarter to a half of the iterations."""
     learning_rate: _Positive = 2e-2
-    """Learning rate for features and SDF network (3QFPI: 1e-3; 3QFP for radar: 1e-2). Measured with
-    SOAP: 2e-2 gives 0.0 to 0.8 points of F-score more than 1e-2 on real scans, and within 0.1 of it
-    on simulated ones."""
+    """Learning rate for features and SDF network (3QFPI: 1e-3; 3QFP for radar: 1e-2). Measured with SOAP: 2e-2 gives 0.0 to
+    0.8 points of F-score more than 1e-2 on real scans, and within 0.1 of it on simulated ones."""
     intensity_learning_rate: _Positive = 1e-2
     """Learning rate for the intensity network (3QFPI: 1e-3). Measured: with Adam, 6e-3 is better."""

@@ -62,8 +62,7 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     Parameters
     ----------
     frames : int or iterable of int
-        Number of scans F, for the scans 0 … F-1; or the scan numbers, one for each scan or one for each return, in any
-        order and with repetitions.
+        Number of scans F, for the scans 0 … F-1; or scan numbers in any order, possibly repeated, such as one for each return.
     every : int
         Distance between held-out scans, at least 2.
 
@@ -258,8 +257,7 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
     Raises
     ------
     ValueError
-        If the shapes differ, a value is infinite, an uncertainty is below 1e-12, or fewer than 20 points are
-        left.
+        If the shapes differ, a value is infinite, an uncertainty is below 1e-12, or fewer than 20 points are known.
     TypeError
         If the values are not real numbers.
 
@@ -329,8 +327,7 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
     Raises
     ------
     ValueError
-        If the shapes differ, a confidence is not in [0, 1], `is_true` has other values than 0 and 1, or no point has a
-        confidence.
+        If the shapes differ, a confidence is not in [0, 1], `is_true` is neither 0 nor 1, or no point has a confidence.
     TypeError
         If the values are not real numbers.
 

@@ -13,8 +13,7 @@ from radarsdf.threads import resolve_num_threads
 
 PROTOCOL = "radarsdf-surface-1"  # changes with the meaning of a number
 
-# As in the paper: distance of a correct point; distance beyond which mesh samples are left out of the accuracy as
-# outliers; and cap on the distances of ground-truth points from the mesh.
+# As in the paper: largest distance of a correct point, and of an inlier; cap on the distances of ground-truth points.
 _THRESHOLD_M, _OUTLIER_M, _TRUNCATION_M = 0.2, 0.4, 2.0
 _CHUNK = 500_000  # samples at a time, to limit memory; the protocol's random numbers depend on it
 _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in float64 over an edge of 1 cm
@@ -32,16 +31,14 @@ def surface_metrics(
     Parameters
     ----------
     mesh : trimesh.Trimesh
-        The surface, world frame, m. Its orientation does not matter. For the angles, neighbouring triangles must share
-        vertices.
+        The surface, world frame, m, of any orientation. For the angles, neighbouring triangles must share vertices.
     ground_truth : (M, 3) array_like
         Lidar points, world frame, m. Accuracy and completion use the same points.
     box : (2, 3) array_like, optional
         Lower and upper corner, world frame, m. Mesh samples and ground truth outside it are ignored. None uses
         everything, which is rarely fair: radar and lidar have different ranges.
     samples : int
-        Points drawn uniformly by area on the triangles whose bounds touch the box. Those outside the box are then
-        dropped; `num_mesh_samples` remain.
+        Points drawn uniformly by area on triangles whose bounds touch the box; `num_mesh_samples` of them lie in it.
 
     Returns
     -------
@@ -70,8 +67,7 @@ def surface_metrics(
     Notes
     -----
     The completion measures distances to samples, not to triangles. Even a perfect mesh has a completion error of half
-    the spacing of the samples, 0.5 · sqrt(area / samples): 5 mm for 1e7 samples on 1000 m². Compare meshes at equal
-    `samples`.
+    the spacing of the samples, 0.5 · sqrt(area / samples): 5 mm for 1e7 on 1000 m². Compare meshes at equal `samples`.
     """
     whole_number(samples, "samples", 1)
     corners = np.array([[-np.inf] * 3, [np.inf] * 3]) if box is None else check_box(box)
@@ -233,8 +229,7 @@ def _angles(vertices: Floats, faces: Ints, corners: Floats) -> Floats:
     pairs, edges = face_adjacency(faces, return_edges=True)  # type: ignore[no-untyped-call]
     inside = _in_box(vertices[edges].mean(axis=1), corners)
     pairs, edges = pairs[inside], edges[inside]
-    # Two triangles of the same orientation traverse their common edge in opposite directions. Otherwise one normal is
-    # flipped.
+    # Triangles of the same orientation traverse their common edge in opposite directions. Otherwise flip one normal.
     forward = [
         ((faces[own] == edges[:, :1]) & (np.roll(faces[own], -1, axis=1) == edges[:, 1:])).any(axis=1)
         for own in pairs.T

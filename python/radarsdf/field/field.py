@@ -269,8 +269,7 @@ class SDFNetwork(Network):
 class IntensityNetwork(Network):
     """Decoder of the intensity that a sensor measures at a point, scaled to about [0, 1].
 
-    By the radar equation, P ∝ σ / r⁴, it depends on range and direction. In dB it is linear in log r, which is
-    therefore the input.
+    By the radar equation, P ∝ σ / r⁴, it depends on range and direction. In dB it is linear in the input log r.
     """
 
     def __init__(self, config: FitConfig) -> None:

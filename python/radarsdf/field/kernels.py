@@ -45,8 +45,7 @@ def layer_views(parameters: Iterable[Tensor]) -> tuple[_Views, _Views]:
 
 def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     """Return zeros in huge memory pages, for random access."""
-    # NumPy requests huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a million rows
-    # takes 1.5 times as long.
+    # NumPy requests huge pages from 4 MB on. In PyTorch's small ones, a step of Adam on a million rows takes 1.5 times as long.
     like = torch.empty(0, dtype=dtype, device="cpu").numpy()
     numbers = np.zeros(math.prod(shape) + _CACHE_LINE, like.dtype)
     first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # or a row would span two lines
@@ -202,9 +201,8 @@ def mlp(inputs: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> Te
     `inputs`: (N, width) each, concatenated to the input of the first layer. `layers`: weights (outputs, inputs) and biases
     (outputs,), like those of ``torch.nn.Linear``. The bits of a row do not depend on the other rows.
     """
-    # The core processes a few rows at a time through all layers. PyTorch, which processes all rows layer by
-    # layer, takes 1.5 times as long. It also makes a dozen calls, each of which acquires the GIL, so two
-    # threads would train hardly faster than one.
+    # The core processes a few rows at a time through all layers. PyTorch, layer by layer, takes 1.5 times as long, and
+    # acquires the GIL in a dozen calls, so that two threads would train hardly faster than one.
     return _MLP.apply(len(layers), *(t for layer in layers for t in layer), *inputs)  # type: ignore[no-untyped-call]
 
 

@@ -54,8 +54,7 @@ class Costmap:
     clearance_m: Floats32
     """(X, Y) distance from the ground to the first occupied voxel above it, m. Infinite where there is none."""
     cost: NDArray[np.int8]
-    """(X, Y) 0 to 99, the larger ratio of slope and step to the limits of the vehicle; 100 where a limit is exceeded or the
-    clearance too low, -1: unknown."""
+    """(X, Y) 0 to 99: larger ratio of slope and step to their limits; 100: beyond a limit, or too low; -1: unknown."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +97,7 @@ class DistanceField:
     """(X, Y, Z) distance to the surface in the nearest occupied voxel, or to the obstacle there, m. Negative inside obstacles
     and up to 2.5 voxels behind the surface; infinite if nothing is occupied."""
     error_m: float
-    """Half a diagonal of a voxel plus the position error of the surface, m. Not an upper bound: false returns and missing
-    surface add to it."""
+    """Half a diagonal of a voxel plus the position error of the surface, m. False returns and missing surface add to it."""
 
     def at(self, x: ArrayLike) -> tuple[Floats32, Floats32]:
         """Interpolate :attr:`surface_m` trilinearly at positions `x` (N, 3), world, m. Raises a ValueError for another shape.
@@ -159,8 +157,7 @@ class Grid:
     probability: Floats32
     """(X, Y, Z) probability of a surface in the voxel. NaN without rays and returns there."""
     distance_m: Floats32
-    """(X, Y, Z) signed distance of the map at the centre of the voxel, m, positive in free space. NaN where it was not
-    observed."""
+    """(X, Y, Z) signed distance of the map at the voxel's centre, m, positive in free space; NaN where not observed."""
     position_error_m: float
     """95 % quantile, over occupied voxels, of the half width of the 95 % confidence interval of the surface's position, m."""
 
@@ -276,8 +273,7 @@ class Grid:
         Parameters
         ----------
         lower_m, upper_m : float
-            Heights above the ground of the column, or of the nearest one with known ground, m. Lower obstacles are passed by
-            the wheels, higher ones by the robot.
+            Heights above the ground of the column, or of the nearest with known ground, m, of what the vehicle may hit.
 
         Returns
         -------
@@ -318,8 +314,7 @@ class Grid:
         Raises
         ------
         ValueError
-            For another suffix, or if the grid is too far from the world's origin for a ``.bt``, 32,768 voxels, or its origin
-            is not a multiple of its voxels.
+            For another suffix, or a ``.bt`` beyond 32,768 voxels from the world's origin, or not at a multiple of its voxels.
         OSError
             If the file cannot be written.
         """
@@ -334,8 +329,7 @@ class Grid:
 
     def _ground(self) -> tuple[Floats32, Floats32]:
         """Return the heights (X, Y) of the ground, world, m, and the clearance above it, m. NaN in columns without ground."""
-        # The ground of a column is the lowest surface on which the signed distance increases upwards. Its height is the zero
-        # crossing of the distance, interpolated between the voxels above and below.
+        # The lowest surface on which the signed distance increases upwards, at its zero crossing between two voxels.
         z = self._z()
         # Nothing is known above the top voxels.
         lower, occupied = self.distance_m, np.pad(self.occupied, ((0, 0), (0, 0), (0, 1)))
@@ -380,7 +374,6 @@ def _planes(height: Floats32, size: float) -> tuple[Floats32, Floats32]:
 
 
 def _checked_obstacles(obstacles: ArrayLike | None) -> Floats:
-    """Convert points (K, 3) or boxes (K, 2, 3) to boxes. Raises a ValueError if they are neither."""
     boxes: Floats = real_array(np.zeros((0, 2, 3)) if obstacles is None else obstacles, "obstacles")
     if boxes.ndim == 2:
         boxes = np.stack([boxes, boxes], axis=1)
@@ -395,8 +388,7 @@ def _distances_to_boxes(
 ) -> Floats32:
     """Compute signed distances (Y, Z), m, from centres (Y, Z, 3) to boxes (K, 2, 3), by their rows `of_voxels` (Y, Z).
 
-    A box without extent is a point of a surface with its normal (K, 3). Behind it, distances are negative in voxels that are
-    not `free` (Y, Z).
+    A box without extent is a point of a surface with its normal (K, 3), with negative distances behind it unless `free` (Y, Z).
     """
     lower, upper = np.moveaxis(boxes[of_voxels], -2, 0)
     away = centres - np.clip(centres, lower, upper)

@@ -33,8 +33,7 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     radar_map : Map
         Fitted with ``returns.free_space``, which is on by default and off in ``quick()``.
     box : (2, 3) array_like
-        Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world, so
-        that grids of adjacent boxes align.
+        Lower and upper corner, world, m, extended to multiples of `voxel_size`, so that grids of adjacent boxes align.
     voxel_size : float
         Edge of a voxel, m. Below that of a leaf cell, the information does not increase. Above it, a voxel is occupied if
         any part of it is, and free only if all of it is.

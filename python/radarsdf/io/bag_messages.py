@@ -102,7 +102,6 @@ def message_types(cdr: bool) -> Any:
 
 
 def _stamp(message: Any) -> tuple[float, str]:
-    """Time, s, and frame of a message; 0 and empty without a header."""
     if not hasattr(message, "header"):
         return 0.0, ""
     stamp = message.header.stamp

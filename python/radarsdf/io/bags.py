@@ -87,8 +87,6 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
 
 class _Radars:
-    """Radars of a bag, each with its own topic or frame."""
-
     def __init__(
         self, paths: list[Path], topics: list[Topic], frames: list[str], request: Request, *, partly: bool
     ) -> None:
@@ -127,7 +125,6 @@ class _Radars:
 
 
 def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
-    """Topics of the scans: those requested, or the only candidate. The others are noted."""
     about = request.notes.about
     fitting = topics_with(bag_messages.CLOUD_TYPES, topics)
     for name in request.topic:
@@ -166,7 +163,6 @@ def _raw_scans(paths: list[Path], topic: Topic, clock: Clock, request: Request) 
 
 
 def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
-    """Topic of the IMU: the one requested, or the only one. None if there is none, or if it is ambiguous."""
     fitting = sorted(topics_with([bag_messages.IMU], topics))
     listed = ", ".join(fitting)
     wanted, about = request.imu_topic, request.notes.about
@@ -178,9 +174,7 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
 
 
 def _read_imu(bags: list[Path], topic: str, radar_frame: str, recorded: bool, request: Request) -> Imu | None:
-    """Read the inertial measurements of a topic; None if it has no gyroscope."""
-    # If scans are stamped with record times (`recorded`), each measurement is shifted by the median delay from stamp to
-    # record, because IMU messages are recorded in batches.
+    # Record times (`recorded`) are stamps plus their median delay, because IMU messages are recorded in batches.
     numbers, frame = array("d"), ""
     for message in read_messages(bags, {topic}, request.notes):
         rates, force = message.content

@@ -67,8 +67,7 @@ def read_points(path: AnyPath) -> Floats:
     Returns
     -------
     (M, 3) float64 ndarray
-        Frame of the file, m; for a PCD file, the frame to which its ``VIEWPOINT`` transforms. Non-finite points are
-        left out.
+        Finite points, m, in the frame of the file; for a PCD file, the frame to which its ``VIEWPOINT`` transforms.
 
     Raises
     ------
@@ -320,10 +319,9 @@ UNNAMED = (".bin", ".npy", *TEXT_SUFFIXES)  # formats whose columns may have no 
 def write_cloud(path: AnyPath, scans: Scans) -> int:
     """Write all returns of scans as one point cloud, atomically.
 
-    The cloud has x, y, z in the world frame, m; intensity in sensor units, doppler in m/s and time, s, if all scans have
-    them; and scan, the index of the scan.
-    Coordinates are float64. LAS and LAZ round them to 0.1 mm, and store the other columns as extra dimensions. PCD holds
-    float32, since most programs read nothing else.
+    The cloud has x, y, z in the world frame, m; scan, the index of the scan; and, if all scans have them, intensity in sensor
+    units, doppler in m/s, and time, s. Coordinates are float64. LAS and LAZ round them to 0.1 mm, and store the other columns
+    as extra dimensions. PCD holds float32, since most programs read nothing else.
 
     Parameters
     ----------

@@ -61,8 +61,7 @@ _FACTORS["speed"] |= {f"{length}/{time}": a / b for length, a in _LENGTHS for ti
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
 SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
-# Names that sensors, drivers and data sets use for a role, in lower case and without separators. The first one found
-# in a cloud is used. Our own names come first.
+# Names of a role in sensors, drivers and data sets, lower case, without separators. The first in a cloud is used, ours first.
 _ALIASES: dict[str, tuple[str, ...]] = {
     "x": ("x",),
     "y": ("y",),

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +18,14 @@ from radarsdf.io.recordings import Request, first_file, lidar_map, natural, read
 from radarsdf.scans import Scans
 
 
-def find_dataset(folder: Path) -> str | None:
-    return next((name for name, (fits, _) in DATASETS.items() if fits(folder)), None)
+class Dataset(NamedTuple):
+    name: str
+    fits: Callable[[Path], bool]  # whether a folder has its layout
+    read: Callable[[Path, Request], Scans]  # with its poses and mounting, unless the request has others
+
+
+def find_dataset(folder: Path) -> Dataset | None:
+    return next((dataset for dataset in _DATASETS if dataset.fits(folder)), None)
 
 
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
@@ -107,11 +114,9 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
     return read_files(files, folder, request, partial(lidar_map, folder))
 
 
-# Whether a folder has the layout of a data set, and its reader: where scans, poses and mounting are, unless the request says
-# so. The first one that fits is used.
-DATASETS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, Request], Scans]]] = {
-    "SNAIL-Radar": (lambda f: any((f / radar).is_dir() for radar in _SNAIL_RADARS), _snail_radar),
-    "View-of-Delft": (lambda f: (_delft_folders(f)[1] / "pose").is_dir(), _view_of_delft),
-    "ColoRadar": (lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
-    "MSC-RAD4R": (lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
-}
+_DATASETS = (
+    Dataset("SNAIL-Radar", lambda f: any((f / radar).is_dir() for radar in _SNAIL_RADARS), _snail_radar),
+    Dataset("View-of-Delft", lambda f: (_delft_folders(f)[1] / "pose").is_dir(), _view_of_delft),
+    Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
+    Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
+)

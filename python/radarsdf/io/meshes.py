@@ -49,8 +49,7 @@ def holds_mesh(path: AnyPath) -> bool:
 def write_mesh(path: AnyPath, mesh: Mesh) -> None:
     """Write a mesh atomically.
 
-    PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. In GLB, a rotation of the root turns the y axis
-    up, as glTF demands.
+    PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. The root of a GLB turns y up, as glTF demands.
 
     Parameters
     ----------
@@ -62,8 +61,7 @@ def write_mesh(path: AnyPath, mesh: Mesh) -> None:
     Raises
     ------
     ValueError
-        For another suffix, if `path` is no regular file, or if float32 is too coarse: farther than 16 km from the
-        origin.
+        For another suffix, if `path` is no regular file, or if float32 is too coarse: beyond 16 km from the origin.
     OSError
         If it cannot be written.
     """

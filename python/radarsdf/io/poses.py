@@ -71,8 +71,7 @@ class Trajectory:
     def pose_at(self, time_s: float, max_gap_s: float) -> Floats | None:
         """Interpolate the pose T_world_base (4, 4) at one time, s; None outside the trajectory and in longer gaps.
 
-        A time up to a millisecond beyond the ends, or beyond the edge of a longer gap, gets the pose there: times in files are
-        rounded.
+        A time up to a millisecond beyond an end, or the edge of a gap, gets the pose there: times in files are rounded.
         """
         if self.held:
             last = int(np.searchsorted(self.times_s, time_s, "right")) - 1

@@ -15,7 +15,7 @@ from radarsdf.io.bag_messages import BAG_SUFFIXES, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import READERS, read_points
 from radarsdf.io.columns import columns_of
-from radarsdf.io.datasets import DATASETS, find_dataset
+from radarsdf.io.datasets import find_dataset
 from radarsdf.io.npz import read_scans
 from radarsdf.rig import checked_rotation
 from radarsdf.scans import Notes, Scans
@@ -39,9 +39,8 @@ def read(
 ) -> Scans:
     """Read scans with poses from a file, a folder or bags.
 
-    Assumptions and omissions are logged by the logger ``radarsdf.io``, and kept in the ``notes`` of the scans.
-    Returns with a non-finite coordinate or intensity, unreadable files, and scans with non-finite poses are
-    skipped and counted.
+    Assumptions and omissions are logged by ``radarsdf.io``, and kept in the ``notes`` of the scans. Returns with a non-finite
+    coordinate or intensity, unreadable files, and scans with non-finite poses are skipped and counted.
 
     Parameters
     ----------
@@ -49,9 +48,8 @@ def read(
         One of
 
         - our ``.npz`` (see :func:`read_scans`);
-        - a folder with a file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ, in natural
-          order or in that of the times in their names, with ``lidar.pcd`` or ``lidar.ply`` as ground truth; or one such
-          file;
+        - the file of a scan, or a folder of them: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ, in natural
+          order or in that of the times in their names, with ``lidar.pcd`` or ``lidar.ply`` as ground truth;
         - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
@@ -69,19 +67,16 @@ def read(
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
-        Rotation from the axes of the IMU to those of the radar. By default that of the file, or of the static transforms of
-        a bag.
+        Rotation from the axes of the IMU to those of the radar. By default that of the file, or of a bag's static transforms.
     world_frame : str, optional
         World frame of poses from TF. By default the root of its tree.
     stamps : {"header", "record"}, optional
         In a bag, the clock of the scans. By default the header stamps, unless they are zero or constant.
     fields : mapping, optional
-        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. None leaves a role
-        out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth and
-        sigma_elevation.
+        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. None leaves a role out.
+        Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth and sigma_elevation.
     columns : int or sequence of str, optional
-        Of files without column names: how many a point has, or their names. By default ``.bin`` files are those of KITTI:
-        float32 x, y, z, intensity.
+        Of files without column names: how many a point has, or their names. By default ``.bin`` is float32 x, y, z, intensity.
     max_gap_s : float
         Longest gap between two poses to interpolate across, s. Scans in longer gaps are skipped and counted.
     ground_truth : path-like or (M, 3) array_like, optional
@@ -149,7 +144,6 @@ def read(
 
 
 def _read(path: Path, request: recordings.Request) -> Scans:
-    """Dispatch on the kind of path: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
     if is_bag(path):
         return read_bags([path], request)
     dataset = find_dataset(path)
@@ -166,7 +160,7 @@ def _read(path: Path, request: recordings.Request) -> Scans:
         return read_bags(bags, request)
     request.refuse(f"{path} is not a bag", *recordings.OF_BAGS)
     if dataset is not None:
-        return DATASETS[dataset][1](path, request)
+        return dataset.read(path, request)
     if path.is_dir():
         files = recordings.cloud_files(path, request.notes)
         return recordings.read_files(files, path, request, partial(recordings.lidar_map, path))

@@ -154,7 +154,7 @@ def scan_poses(
         check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
     elif times_s is None:
         if not isinstance(poses, Trajectory) or len(poses.times_s) != count:
-            msg = f"{about}: the {count} scans have no time stamps, and the number of poses ({poses.span()}) differs"
+            msg = f"{about}: {count} scans without times cannot be matched to the poses from {poses.span()}: give as many, or times.txt"
             raise ValueError(msg)
         request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()
@@ -218,7 +218,7 @@ def cloud_files(folder: Path, notes: Notes) -> list[Path]:
             kept = [path for path in paths if not (is_text and path.stem in clouds)]
             length = max(Counter(map(_words, kept)).values(), default=0)
             found.append((not is_text or length > 1, -place, length, not is_text, kept))
-    *_, length, _, files = max(found, key=itemgetter(0, 1, 2, 3), default=(0, []))
+    *_, length, _, files = max(found, key=itemgetter(0, 1, 2, 3), default=(0, None, []))
     words = Counter(map(_words, files))
     odd = [path for path in files if 2 * length > len(files) > 2 and words[_words(path)] == 1]
     if odd:
@@ -249,9 +249,7 @@ def lidar_map(folder: Path) -> Floats | None:
 
 
 def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path], list[float] | None, Poses]:
-    """Sort scans by time; return files, times, s, or None if there are none, and poses."""
-    # Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
-    # file of times.
+    # Poses without times are matched by index, in the order of the times in the names of files, or of a file of times.
     times = times_in([path.stem for path in files], notes)
     listed = None
     if times is None:

@@ -64,8 +64,7 @@ class LiveMap:
         Settings. :meth:`mesh` and :meth:`map` use those of :meth:`FitConfig.quick` with the same cells, returns, and bridges
         over gaps; :meth:`finish` uses all of them.
     origin : (3,) array_like, optional
-        Origin of the local frame, world, m. Default: the first sensor position, rounded to the nearest block corner of
-        ``config.lattice``.
+        Origin of the local frame, world, m. Default: the block corner of ``config.lattice`` nearest to the first sensor.
     max_bytes : int, optional
         Memory limit, bytes, above which the oldest scans are sealed: they stay in the map, but can no longer be moved or
         removed. Default: no limit; with a folder, all scans are written there.
@@ -92,8 +91,7 @@ class LiveMap:
     All methods are thread-safe, and changes are atomic: after any error, the map is as before; after Ctrl-C or another
     asynchronous exception, a change is either complete or absent. A map belongs to the process that created it: in one forked
     from it, methods that change the map or may use its folder raise a RuntimeError. Poses are T_world_sensor, m.
-    Methods that change the map return the ascending keys (B,), uint64, of the blocks of 8 × 8 × 8 leaf cells with changed or
-    removed returns.
+    Methods that change the map return the ascending keys (B,), uint64, of the changed blocks of 8 × 8 × 8 leaf cells.
 
     Examples
     --------
@@ -358,9 +356,9 @@ class LiveMap:
     def close_loops(self) -> Keys:
         """Refine the poses of tracked scans where places are revisited, as :func:`radarsdf.refine_poses`, and move the scans to them.
 
-        Nothing changes if no place is revisited, or if held-out returns do not agree better. Given poses, and that of the first
-        scan, are kept. Scans may be integrated meanwhile: tracked ones move rigidly with the last refined scan. If others are moved or
-        removed meanwhile, nothing changes.
+        Given poses, and that of the first scan, are kept. Tracked scans that are integrated meanwhile move rigidly with the last
+        refined one. Nothing changes if no place is revisited, if held-out returns do not agree better, or if scans are moved or
+        removed meanwhile.
 
         Raises
         ------

@@ -40,8 +40,7 @@ _FIT_RETURNS = 4_000_000
 class GrowingState:
     """Sums over scans, the scans, and the surface derived from them. Not thread-safe.
 
-    Each change is prepared in new objects and made by one :func:`at_once`, so that an asynchronous exception, such as Ctrl-C,
-    leaves it complete or absent.
+    Each change is prepared in new objects and made by one :func:`at_once`: asynchronous exceptions leave it complete or absent.
     """
 
     def __init__(

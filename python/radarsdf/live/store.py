@@ -322,7 +322,6 @@ def read_regions(folder: Path | None, regions: Keys, num_radars: int) -> tuple[K
 
 
 def _columns_of(num_radars: int) -> dict[str, tuple[Any, ...]]:
-    """Return the types of the columns of cells and blocks by name, radar by radar."""
     suffixes = ["", *(f" of radar {k}" for k in range(1, num_radars))]
     return {name + suffix: kind for suffix in suffixes for name, kind in _CELL_COLUMNS.items()}
 

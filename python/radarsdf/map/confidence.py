@@ -183,8 +183,7 @@ def dense_cells(
 
 def free_space_odds(contents: MapContents) -> Floats:
     """Return the odds (8,) that a leaf cell crossed by 0 to 7 or more scans is behind rather than before a surface."""
-    # Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells because of noise,
-    # and on the way to false returns.
+    # Calibrated on cells clearly on one side of a surface: noise and false returns make rays cross solid cells.
     keys = contents.field.table.leaf_keys()
     keys = keys[:: max(1, len(keys) // _ODDS_CELLS)]
     leaf_m = contents.config.leaf_size_m

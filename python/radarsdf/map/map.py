@@ -14,7 +14,7 @@ from radarsdf.arrays import Array, ArrayLike, Bools, Floats, Mesh
 from radarsdf.checks import MAX_POSITION_M, AnyPath, check, check_pose, positive, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
-from radarsdf.map.colors import intensity_colors
+from radarsdf.map.colors import Scale
 from radarsdf.map.confidence import CellsInBox, EvidenceAt, confidence, free_space_odds, uncertainty
 from radarsdf.map.threshold import VOXEL_M
 from radarsdf.map.view import DepthImage, View, ViewedMap, view_from
@@ -36,9 +36,8 @@ class Map(ABC):
     UTM lose no precision. A wrong shape raises a ValueError; values that are not real numbers, or a tensor on another device,
     raise a TypeError. Queries are thread-safe, and a map can be pickled.
 
-    A map covers the leaf cells near returns, see :meth:`observed`. Elsewhere, free space included, and at non-finite
-    positions, the signed distance, its gradient and the intensity are NaN. Without returns near a position, the uncertainty
-    is NaN and the confidence 0.
+    A map covers the leaf cells near returns, see :meth:`observed`. Elsewhere, free space included, and at non-finite positions,
+    signed distance, gradient and intensity are NaN. Without returns near a position, the uncertainty is NaN and the confidence 0.
     """
 
     def sdf(self, x: Any, *, extrapolate: bool = False, return_gradient: bool = False) -> Any:
@@ -57,8 +56,7 @@ class Map(ABC):
         -------
         (N,) ndarray or Tensor
             Signed distance, m: positive in free space, zero on the surface, negative behind it. NaN where `x` was not
-            :meth:`observed`, or is not finite. It is learnt along the sensor's rays, so it exceeds the Euclidean distance at
-            grazing incidence.
+            :meth:`observed`, or is not finite. Learnt along rays, it exceeds the Euclidean distance at grazing incidence.
         """
         world, answer = as_positions(x)
         if return_gradient:
@@ -128,8 +126,7 @@ class Map(ABC):
     ) -> Any:
         """Predict the intensity of the return that a sensor would measure at each position.
 
-        Only views like those of the returns of the fit are predicted: from a range within a factor of 1.7, at an elevation
-        within about 4° of a return's.
+        Only views like those of the fit are predicted: within a factor of 1.7 of the range, and 4° of the elevation, of a return.
 
         Parameters
         ----------
@@ -146,8 +143,7 @@ class Map(ABC):
         Returns
         -------
         (N,) ndarray or Tensor
-            Intensity, sensor units. NaN where `x` was not :meth:`observed`, from ranges and elevations unlike those of all
-            returns, or a position is not finite.
+            Intensity, sensor units. NaN where `x` was not :meth:`observed`, for other views, or if a position is not finite.
 
         Raises
         ------
@@ -200,8 +196,7 @@ class Map(ABC):
             World frame, m. Triangles and vertex normals face free space. Empty if there is no surface.
 
             - ``vertex_attributes``: `confidence` and `uncertainty_m`, (V,) float32. With a viewpoint also `intensity`,
-              sensor units, and vertex colours for it, from dark (low) to bright (high); NaN and grey where :meth:`intensity`
-              is NaN, as from far away or above.
+              sensor units, and vertex colours for it, from dark (low) to bright (high); grey where :meth:`intensity` is NaN.
             - ``metadata``: `leaf_cells` of the map, and `leaf_cells_searched`, those that may contain surface;
               the applied `min_confidence`; `expected_precision`, the share of the mesh that is expected to be true;
               `coverage_of_observed`, the expected share of the surface with returns that the mesh covers;
@@ -228,7 +223,7 @@ class Map(ABC):
             return mesh
         values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position).astype(np.float32)
         mesh.vertex_attributes["intensity"] = values
-        mesh.visual.vertex_colors = intensity_colors(values, scale.low, scale.high)
+        mesh.visual.vertex_colors = Scale(scale.low, scale.high)(values)
         return mesh
 
     def render(

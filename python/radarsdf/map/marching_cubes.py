@@ -47,8 +47,7 @@ def marching_cubes(
     origin : array_like, shape (3,)
         Position of sample (0, 0, 0), in world units.
     mask : array_like of bool, shape (nx, ny, nz), optional
-        True for valid samples. A cell is triangulated if all its eight samples are valid and none is NaN.
-        Default: all are valid.
+        True for valid samples, by default all. A cell is triangulated if its eight samples are valid and none is NaN.
     num_threads : int
         Number of threads. 0: that of OpenMP.
 
@@ -64,8 +63,7 @@ def marching_cubes(
     TypeError
         If `volume` is not real or `mask` is not boolean.
     ValueError
-        If shapes do not match, `spacing`, `origin` or `level` is out of range, or there are too many
-        vertices for int32.
+        If shapes do not match, `spacing`, `origin` or `level` is out of range, or there are too many vertices for int32.
 
     Examples
     --------

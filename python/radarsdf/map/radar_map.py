@@ -39,8 +39,7 @@ FORMAT = "radarsdf.map"
 FORMAT_VERSION = 14
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 _EVIDENCE = {"information": np.float32, "hits": np.uint32, "visibility": np.uint32}  # types of its columns
-# Types and shapes of the arrays of other parts. Bits and keys are stored as int64, which all readers of safetensors support;
-# keys have at most 63 bits, like those of leaf cells.
+# Types and shapes of the arrays of other parts. Bits and keys (63 bits) are int64, which all readers of safetensors support.
 _PARTS: dict[str, dict[str, tuple[Any, ...]]] = {
     "free_space": {"keys": (np.int64, None), "planes": (np.int64, None, None, None)},
     "view_statistics": {

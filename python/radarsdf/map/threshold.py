@@ -68,9 +68,9 @@ class Threshold:
 
     def __str__(self) -> str:
         return (
-            f"kept from a confidence of {self.min_confidence:.2f} on: {self.expected_precision:.0%} of it is expected to be "
-            f"true, and to cover {self.coverage_of_observed:.0%} of the surface that returns lie on; of all surface that was "
-            f"found, {self.whole_precision:.0%} and {self.whole_coverage_of_observed:.0%}"
+            f"cut at a confidence of {self.min_confidence:.2f}: an expected {100 * self.expected_precision:.0f} % of it is true "
+            f"surface, which covers {100 * self.coverage_of_observed:.0f} % of the surface with returns; uncut, they are "
+            f"{100 * self.whole_precision:.0f} and {100 * self.whole_coverage_of_observed:.0f} %"
         )
 
 

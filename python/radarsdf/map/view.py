@@ -21,9 +21,8 @@ from radarsdf.threads import resolve_num_threads
 
 _Intensity = Callable[[Floats, Floats], Floats32]  # (N,) from points (N, 3) and a sensor (3,), m
 
-# The density of returns on the surface is rate^a · cosine^b / range^c, times d if the patch is occluded: (a, b, c, d) in
-# smooth scenes, where returns are spread by angle, and in rough ones, where a radar sees much behind surfaces. Tuned with
-# `python -m bench.paper novel-views`.
+# The density of returns on the surface is rate^a · cosine^b / range^c, times d if the patch is occluded: (a, b, c, d) in smooth
+# scenes, and in rough ones, where a radar sees much behind surfaces. Tuned with `python -m bench.paper novel-views`.
 _SMOOTH = np.array([1.0, 1.0, 2.0, 0.01])
 _ROUGH = np.array([2.2, 0.3, 1.0, 0.65])
 _HIDDEN_M = 0.5  # distance behind the first surface from which on a patch is occluded

@@ -124,8 +124,7 @@ def save_trajectory_picture(
 ) -> None:
     """Save a PNG picture of trajectories from above, with the returns.
 
-    `points`: (N_i, 3) per scan, sensor frame, m; the last trajectory places them. `trajectories`: poses (F, 4, 4)
-    T_world_sensor by name.
+    `points`: (N_i, 3) per scan, sensor frame, m, placed by the last of the `trajectories`: T_world_sensor (F, 4, 4) by name.
     """
     poses = list(trajectories.values())[-1]
     step = max(1, sum(map(len, points)) // _MAX_RETURNS)

@@ -6,7 +6,7 @@ from radarsdf.arrays import ArrayLike, Bytes, Floats, Floats32, Ints32, Mesh
 from radarsdf.checks import AnyPath, check, real_array
 from radarsdf.core import SurfaceTracer
 from radarsdf.io.files import write_whole
-from radarsdf.map.colors import NEUTRAL, Scale, intensity_colors
+from radarsdf.map.colors import NEUTRAL, SHARES, Scale
 from radarsdf.render.figures import new_figure, png_of
 from radarsdf.threads import resolve_num_threads
 
@@ -113,8 +113,7 @@ def save_picture(
     mesh : trimesh.Trimesh
         The surface, m, with z up.
     scalar : (V,) array_like, optional
-        A value per vertex, such as its intensity, coloured from the 2nd to the 98th percentile. NaN is grey. None: all of
-        the surface is light grey.
+        A value per vertex, such as its intensity, coloured from the 2nd to the 98th percentile; NaN is light grey. None: all is.
     label : str
         Text of the colour bar, with the unit.
     width, height : int
@@ -127,7 +126,7 @@ def save_picture(
     ImportError
         If matplotlib is not installed. It comes with the extra `plot`.
     ValueError
-        As `render` and `intensity_colors`, or if the shape of `scalar` is wrong.
+        As `render`, or if the shape of `scalar` is wrong.
     OSError
         If the file cannot be written.
     """
@@ -145,7 +144,7 @@ def save_picture(
         scale = Scale.of(values)
         image = render(mesh, scale(values), width=round(0.9 * width), height=height, viewpoint=viewpoint)
         axes = figure.add_axes((0.92, 0.3, 0.012, 0.4))
-        steps = intensity_colors(np.linspace(0, 1, 256), 0, 1) / 255.0
+        steps = SHARES(np.linspace(0, 1, 256)) / 255.0
         shades = ScalarMappable(Normalize(scale.low, scale.high), ListedColormap(steps))
         bar = figure.colorbar(shades, cax=axes, extend="both")
         bar.set_label(label, size=13)

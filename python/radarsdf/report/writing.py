@@ -226,7 +226,6 @@ def intensity_values(subject: Subject) -> dict[str, Any] | None:
 
 
 def _density(measured: Floats, found: Floats) -> bytes:
-    """Plot the density of predicted over measured intensities (N,), with the diagonal."""
     from matplotlib.colors import LogNorm  # noqa: PLC0415 - an extra
 
     figure, ax = _subplots()
@@ -333,7 +332,6 @@ def scene(
 
 
 def _write_page(path: AnyPath, template: str, **values: Any) -> int:
-    """Fill a template and write the page atomically. Returns the size of the file, bytes."""
     made = time.strftime("%Y-%m-%d %H:%M")
     environment, filters = templates_of("report"), (centre_of, data_uri, fixed, math.degrees, percent)
     environment.filters |= {own.__name__: own for own in filters}

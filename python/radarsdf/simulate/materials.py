@@ -45,8 +45,7 @@ CONCRETE = Material("concrete", 3.0, specular=0.8, lobe_width_rad=0.3, texture_d
 BRICK = Material("brick", 1.0, specular=0.6, lobe_width_rad=0.4, texture_db=3.0, mirror_loss_db=18.0)
 GLASS = Material("glass", 0.0, specular=0.97, lobe_width_rad=0.12, looks=4.0, mirror_loss_db=5.0)
 METAL = Material("metal", 9.0, specular=0.9, lobe_width_rad=0.25, looks=2.0, mirror_loss_db=6.0)
-# Plates of a corner reflector. They cause no ghosts: `CornerReflector.retro_db` models the waves reflected between
-# them.
+# Of a corner reflector, without ghosts: `CornerReflector.retro_db` models the waves reflected between its plates.
 REFLECTOR = Material("reflector plate", -6.0, specular=0.5, looks=8.0)
 STEEL_POLE = Material("steel pole", 6.0, specular=0.6, lobe_width_rad=0.5)
 TREE = Material("tree", -2.0, specular=0.2, lobe_width_rad=0.6, looks=2.0, texture_db=2.0)

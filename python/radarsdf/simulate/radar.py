@@ -26,8 +26,7 @@ _Power = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 _OFF_SURFACE_M = 1e-6  # offset of a reflected ray from the mirror, so that it does not hit it again
 _MIN_LEG_M = 0.01  # shorter paths from a mirror to the next surface are no reflection
-# Independent streams of random numbers within a scan: for example, more clutter must not change the noise of surface
-# returns.
+# Independent random streams within a scan: more clutter, for example, must not change the noise of surface returns.
 _BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER, _SIDELOBES, _PHANTOMS = range(8)
 _PLACES = 2**31 + 3  # no scan has this index: phantoms keep their places
 _PHANTOM_CELL_M = 0.5
@@ -77,8 +76,7 @@ class RadarSensor:
     """A scanning 3D radar. Sensor frame: x forward, y left, z up.
 
     By the radar equation, the power of a return in dB is ``gain_db`` + echo of the surface − ``range_loss_db``·log10(range in m)
-    + speckle + noise. Speckle is the fading of ``Material.looks`` independent scatterers: a Gamma distribution, with its
-    median at 0 dB.
+    + speckle + noise. Speckle is the fading of ``Material.looks`` independent scatterers, of Gamma distribution and median 0 dB.
 
     The standard deviation of a position is √(``sigma_range_m²`` + (``sigma_range_per_m`` · range)²) along the beam, and
     ``sigma_azimuth_rad`` · range and ``sigma_elevation_rad`` · range across it. Each is multiplied by
@@ -158,8 +156,7 @@ class RadarSensor:
     ) -> Floats:
         """Received power (N,), dB, of surface hits by the radar equation, without speckle or clipping; -inf without a hit.
 
-        Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m. `before_m`: paths (N,) to
-        the origins.
+        Origins of the rays are (3,) or (N, 3), directions (N, 3) unit vectors, world, m. `before_m`: paths (N,) to the origins.
         """
         range_m = np.where(hits.primitive >= 0, hits.range_m, 1.0)
         echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
@@ -307,8 +304,7 @@ class Simulation:
     def ground_truth(self) -> Floats:
         """(M, 3) lidar points of the surfaces that the radar can detect, world frame, m.
 
-        They have a noise of 1 cm along the ray, and at most one point per cell of 5 cm. Computed on first access: it takes as
-        long as the scans.
+        They have a noise of 1 cm along the ray, and at most one point per cell of 5 cm. Computing them takes as long as the scans.
         """
         rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
         found = [np.zeros((0, 3))]

@@ -263,9 +263,8 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
 def wall(seed: int = 0, frames: int | None = None) -> Simulation:
     """Simulate an arc of 10 m radius round a corner reflector on a wall, for view dependence. Some walls have windows.
 
-    Arguments and result are those of :func:`hugin`, with 90 scans by default, between -80 and 80 degrees from the normal of the
-    wall. Intensities are 80 to 133 dB, as of a Hugin A4. The front of the wall is the plane x = 0. The reflector is at y = 0
-    and is the last of `scene.solids`.
+    Arguments and result are those of :func:`hugin`, with 90 scans by default, at -80 to 80 degrees from the normal of the wall,
+    the plane x = 0. The reflector, at y = 0, is the last of `scene.solids`. Intensities are 80 to 133 dB, as of a Hugin A4.
     """
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.05, materials.GRASS)
@@ -293,8 +292,7 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
 def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     """Simulate an automotive radar on a street: few scans, noise that grows with the range, and many false returns.
 
-    The radar is tuned to four drives of the Astyx HiRes2019 dataset; ``docs/simulation.md`` lists the figures. The world is a
-    similar street, not a copy.
+    The radar is tuned to four drives of the Astyx HiRes2019 dataset (``docs/simulation.md``); the street is similar, not a copy.
 
     Arguments and result are those of :func:`hugin`, with 20 scans by default, along a path of four seconds at 5 to 10 m/s.
     Intensities are 45 to 102 dB, as of an Astyx HiRes 2019. There are clutter, ghosts and side lobes.

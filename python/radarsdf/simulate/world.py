@@ -310,8 +310,7 @@ class Scene:
         Returns
         -------
         Hits
-            `range_m` (N,), m, `normals` (N, 3), world, and `primitive` (N,), the index in `parts`. Inf, zeros and -1
-            without a hit.
+            `range_m` (N,), m, `normals` (N, 3), world, and `primitive` (N,), index in `parts`; inf, 0 and -1 without a hit.
         """
         directions = np.asarray(directions, dtype=np.float64)
         origins = np.broadcast_to(np.asarray(origins, dtype=np.float64), directions.shape)
@@ -333,8 +332,7 @@ class Scene:
     def signed_distance(self, points: ArrayLike) -> Floats:
         """Compute signed distances (N,) float64, m, of points (N, 3), world, m, to the union of all parts.
 
-        They are positive in free space. Metres above rough ground they may be too large; inside overlapping solids, the
-        absolute value may be too small.
+        Positive in free space. They may be too large metres above rough ground, and too near 0 inside overlapping solids.
         """
         p = np.asarray(points, dtype=np.float64)
         return reduce(np.minimum, (part.signed_distance(p) for part in self.parts), np.full(len(p), np.inf))

@@ -110,8 +110,7 @@ class TileBlend(Map):
 
     def _known_shares(self, world: Floats, seen: Bools) -> Iterator[Share]:
         """Yield the shares of tiles in whose leaf cells, or on their border, positions (N, 3), world, m, are. Set `seen` (N,)."""
-        # Tiles disagree, because ghosts depend on surfaces in front of them. The tile that contains a position decides; for
-        # an unfinished one, its neighbours do.
+        # Ghosts depend on surfaces in front of them, so tiles disagree: that of a position decides, or else its neighbours.
         near, owners = list(self._near(world)), np.full(len(world), -1)
         for number, (tile, rows) in enumerate(near):
             owners[rows[(self.plan.grid.tiles_of(world[rows]) == tile.tile).all(axis=1)]] = number

@@ -58,8 +58,7 @@ def fit_tiles(
     tile_size : float, optional
         Edge of a tile, m, rounded to blocks of ``config.lattice``. Default: 512 leaf cells.
     halo : float, optional
-        Width of the margin of returns round each tile that are fitted, too, m, rounded to blocks. Tiles overlap in half of it.
-        Default: 64 leaf cells.
+        Width of the margin of returns that a tile fits, too, m, rounded to blocks; half of it overlaps. Default: 64 leaf cells.
     executor : concurrent.futures.Executor, optional
         Executor of the fits: of processes, or of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
         By default, tiles are fitted one after another in this process.

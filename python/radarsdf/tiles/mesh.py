@@ -144,9 +144,7 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted:
     return whole.mesh(np.zeros(3), limits, leaf_cells)
 
 
-def meshes_of(
-    city: TileBlend, voxel_size: float, progress: bool | None = False, **wanted: Any
-) -> Iterator[Mesh]:
+def meshes_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> Iterator[Mesh]:
     """Yield the mesh of each tile, which may be empty. Small components that reach a border are kept."""
     paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     for path in paths:
@@ -186,8 +184,7 @@ def write_tileset(
 ) -> tuple[int, int]:
     """Write ``NAME.json`` and in a folder ``NAME`` a GLB file per tile with triangles.
 
-    GLB files hold float32 relative to the origin of the tile, which is float64 in the JSON: precision does not depend on the
-    distance from the world's origin.
+    GLB files hold float32 relative to the origin of the tile, float64 in the JSON: as precise far from the world's origin.
     """
     folder = path.with_suffix("")
     check_outputs([path])

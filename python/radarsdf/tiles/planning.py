@@ -263,8 +263,7 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     """Rays that cross a tile, in the frame of its map, with intensities in one unit; and the mask (N,) of returns in it or its halo."""
     path = rays_path(folder, tile.tile)
     whole = path.exists() and path.stat().st_size == tile.rays * _RECORD.itemsize
-    wrong = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean"
-    check(whole, f"{wrong}: fit in a new folder")
+    check(whole, f"{path} does not hold the {tile.rays} rays of the plan: plan again in a new folder")
     rows = np.fromfile(path, _RECORD)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
     of_scans = np.array(array_in(folder / SCANS_FILE)[numbers])  # a memory map, of which few rows are read

@@ -1,14 +1,14 @@
 """One map over many tiles."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from radarsdf.arrays import Floats
+from radarsdf.arrays import Floats, Mesh
 from radarsdf.checks import AnyPath, check, path_of
 from radarsdf.io.files import check_outputs, checked_suffix
 from radarsdf.io.meshes import MESH_SUFFIXES, write_mesh
@@ -29,8 +29,7 @@ class TiledMap(TileBlend):
 
     It has the methods of :class:`Map`. Where tiles overlap, their fields are averaged with weights that fall smoothly to zero,
     so neither surface, gradient nor intensity has a seam. Tiles are read on demand. The voxels of :meth:`mesh` must divide the edge
-    of a leaf cell, so that triangles of adjacent tiles fit together. They are cached in the folder: another mesh of the same
-    `voxel_size` and `box` is fast.
+    of a leaf cell, so that triangles of adjacent tiles fit together. They are cached in the folder by `voxel_size` and `box`.
 
     Parameters
     ----------
@@ -46,7 +45,6 @@ class TiledMap(TileBlend):
     """
 
     _viewed: tuple[list[TilePlan], ViewedMap] | None = None
-    meshes = meshes_of
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
@@ -58,6 +56,9 @@ class TiledMap(TileBlend):
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> Any:
         return mesh_of(self, voxel_size, **wanted)
+
+    def meshes(self, voxel_size: float) -> Iterator[Mesh]:
+        return meshes_of(self, voxel_size, progress=False)
 
     def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         """Each cell belongs to the tile that contains it; cells of unfinished tiles are unknown."""

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats
 from radarsdf.grids.grid import Grid
-from radarsdf.io.ros2 import Node, Subscription, encode, make_message
+from radarsdf.io.dds import encode, make_message
+from radarsdf.io.subscription import Subscription
 from radarsdf.scans import Scan
 from radarsdf.view.sinks import Sink
 
@@ -18,8 +19,8 @@ _OCCUPANCY = np.array([0, 100, -1], np.int8)  # of free, occupied and unknown co
 class Ros2Sink(Sink):
     """Publishes the pose of the carrier of the radars, surface, grid; and its transform unless others do."""
 
-    def __init__(self, node: Node, drive: Subscription) -> None:
-        self._node, self._drive = node, drive
+    def __init__(self, drive: Subscription) -> None:
+        self._node, self._drive = drive.node, drive
 
     def show_scan(self, scan: Scan, time_s: float) -> None:
         frame, T_frame_sensor, published = self._drive.carrier(scan.sensor)

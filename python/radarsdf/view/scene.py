@@ -1,8 +1,7 @@
 """Scene of a viewer's page: the surface and one scan, redrawn by a thread from the newest state of the controls.
 
-viser takes vertex colours only with a whole mesh, which is too much for each step of a drag and leaves the page blank
-between two meshes. So a step recolours a cloud of some vertices in place. After the drag a new mesh is sent, and the old
-scene stays until the page has drawn it.
+viser takes vertex colours only with a whole mesh: too much for each step of a drag, and the page is blank between two. So a
+step recolours a cloud of some vertices. The new mesh comes after the drag, and the old scene stays until it is drawn.
 """
 
 import threading

@@ -1,12 +1,11 @@
-"""Topics of running ROS 2 nodes by DDS, without ROS: scans, poses of TF or odometry, and publishing."""
+"""Scans of running ROS 2 topics, with poses of TF or odometry."""
 
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache, partial
-from importlib import import_module
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,151 +13,20 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
-from radarsdf.extras import require
 from radarsdf.io import bag_messages
-from radarsdf.io.bag_messages import Clock, Message, decode, message_types
+from radarsdf.io.bag_messages import Clock, Message, decode
 from radarsdf.io.bag_poses import Track, Tracks, TransformTree, topic_poses, tree_poses
+from radarsdf.io.dds import QUEUED, Node
 from radarsdf.io.poses import UNPOSED, NoPoses
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed
 from radarsdf.rig import Label
 from radarsdf.scans import Notes, Scan
 
-LOOPBACK = "127.0.0.1"
-# Peers on this machine by unicast, as rmw_cyclonedds with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST.
-_THIS_MACHINE = (
-    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
-    "<MaxAutoParticipantIndex>99</MaxAutoParticipantIndex>"
-    '<Peers><Peer address="localhost"/></Peers></Discovery>'
-)
-_QUEUED = 100  # scans of a radar: 5 s at 20 Hz
 _KEPT_POSES = 1000  # of each frame: tf2 keeps those of 10 s
 _SET_BACK_S = 1.0  # more than poses of several nodes are out of order
 _PATIENCE_S = 3.0  # for poses of the first scan, and until it is reported what is missing
 _STEP_S = 0.01
 _STATIC = "/tf_static"
-_BASIC, _MESSAGE, _ARRAY = 1, 2, 3  # kinds of fields of rosbags; else a sequence
-
-
-class Node:
-    """A participant in a DDS domain, at the interface of address `host`. It exchanges encoded messages."""
-
-    def __init__(self, domain: int, host: str = LOOPBACK) -> None:
-        self.domain, dds = domain, _cyclonedds()
-        chosen = 'autodetermine="true"' if host == "0.0.0.0" else f'address="{host}"'
-        general = f"<General><Interfaces><NetworkInterface {chosen}/></Interfaces>"
-        rest = _THIS_MACHINE if host == LOOPBACK else "</General>"
-        try:
-            # A configuration, in place of that of the environment.
-            configuration = f"<CycloneDDS><Domain>{general}{rest}</Domain></CycloneDDS>"
-            self._domain = dds.domain.Domain(domain, configuration)
-            self._participant = dds.domain.DomainParticipant(domain)
-        except dds.core.DDSException as error:
-            msg = f"DDS domain {domain} cannot be joined at {host}: {error.msg}; --host takes the address of an interface"
-            raise OSError(msg) from error
-        builtin = dds.builtin
-        self._found = builtin.BuiltinDataReader(self._participant, builtin.BuiltinTopicDcpsPublication)
-        self._writers: dict[str, Any] = {}
-
-    def close(self) -> None:
-        self._domain._delete(self._domain._ref)
-
-    def published(self) -> dict[str, dict[str, bool]]:
-        """By topic, the types of messages, and whether all who publish them are reliable."""
-        reliability = _cyclonedds().qos.Policy.Reliability
-        topics: dict[str, dict[str, bool]] = {}
-        for endpoint in self._found.read(10_000):
-            # Those that left have no name.
-            package, _, name = (endpoint.type_name or "").partition("::msg::dds_::")
-            if name and endpoint.topic_name.startswith("rt/"):
-                types = topics.setdefault(endpoint.topic_name[2:], {})
-                kind, policy = f"{package}/msg/{name[:-1]}", endpoint.qos[reliability]
-                types[kind] = types.get(kind, True) and isinstance(policy, reliability.Reliable)
-        return topics
-
-    def reader(self, topic: str, message_type: str, *, reliable: bool, latched: bool = False) -> Any:
-        """Return a reader, `reliable` if all publishers are: else it matches none of the others. `latched`: they keep their last message."""
-        qos = _qos(_QUEUED, reliable=reliable, latched=latched)
-        return _cyclonedds().sub.DataReader(self._participant, self._topic(topic, message_type), qos=qos)
-
-    def publish(self, topic: str, message: Any, *, encoded: bytes = b"", latched: bool = False) -> None:
-        """Publish a message of rosbags; `latched`: later subscribers get the last one, too."""
-        if topic not in self._writers:
-            at = self._topic(topic, message.__msgtype__)
-            qos = _qos(1 if latched else _QUEUED, reliable=True, latched=latched)
-            self._writers[topic] = _cyclonedds().pub.DataWriter(self._participant, at, qos=qos)
-        writer = self._writers[topic]
-        writer.write(writer.data_type(encoded or encode(message)))
-
-    def _topic(self, name: str, message_type: str) -> Any:
-        return _cyclonedds().topic.Topic(self._participant, f"rt{name}", _dds_type(message_type))
-
-
-@cache
-def _cyclonedds() -> Any:
-    """Import an extra, with those of its modules that are used here."""
-    found = require("rosbags", "cyclonedds", what="topics of ROS 2 need")
-    for name in ("builtin", "core", "domain", "idl", "pub", "qos", "sub", "topic"):
-        import_module(f"cyclonedds.{name}")
-    return found
-
-
-def _qos(depth: int, *, reliable: bool, latched: bool) -> Any:
-    policy = _cyclonedds().qos.Policy
-    return _cyclonedds().qos.Qos(
-        policy.Reliability.Reliable(10**8) if reliable else policy.Reliability.BestEffort,
-        policy.Durability.TransientLocal if latched else policy.Durability.Volatile,
-        policy.History.KeepLast(depth),
-        policy.DataRepresentation(use_cdrv0_representation=True),
-        policy.IgnoreLocal.Participant,
-    )
-
-
-@cache
-def _dds_type(message_type: str) -> Any:
-    """Type for cyclonedds of messages of rosbags, with fields and names as those of ROS 2, by which peers match.
-
-    Its instances hold the bytes of a message, which rosbags encodes and decodes, as those in bags.
-    """
-    idl = _cyclonedds().idl
-    types = idl.types
-
-    def hint(kind: int, of: Any) -> Any:
-        if kind == _BASIC:
-            known = {"string": str, "bool": bool, "byte": types.uint8, "char": types.uint8}
-            return known.get(of[0]) or getattr(types, of[0])
-        if kind == _MESSAGE:
-            return _dds_type(of)
-        part = hint(*of[0])
-        return types.array[part, of[1]] if kind == _ARRAY else types.sequence[part]
-
-    package, _, name = message_type.split("/")
-    fields = {field: hint(*of) for field, of in message_types(cdr=True).fielddefs[message_type][1]}
-    made: Any = idl.make_idl_struct(f"{name}_", f"{package}::msg::dds_::{name}_", fields, dataclassify=False)
-    # A base class would be part of the type.
-    made.__init__ = lambda message, data: message.__dict__.update(data=data)
-    made.serialize = lambda message, **_: message.data
-    made.deserialize = made.deserialize_key = classmethod(lambda of, data, **_: of(data))
-    return made
-
-
-def encode(message: Any) -> bytes:
-    return bytes(message_types(cdr=True).serialize_cdr(message, message.__msgtype__))
-
-
-def make_message(message_type: str, **values: Any) -> Any:
-    """Make a message of rosbags. Fields without values are zero or empty."""
-
-    def zero(kind: int, of: Any) -> Any:
-        if kind == _BASIC:
-            return "" if of[0] == "string" else 0
-        if kind == _MESSAGE:
-            return make_message(of)
-        part, name = of[0]
-        return np.zeros(of[1], name[0]) if part == _BASIC else []
-
-    types = message_types(cdr=True)
-    fields = types.fielddefs[message_type][1]
-    return types.types[message_type](**{f: values[f] if f in values else zero(*of) for f, of in fields})
 
 
 class _RecentTrack(Track):
@@ -179,8 +47,6 @@ class _RecentTrack(Track):
 
 
 class _Known(NamedTuple):
-    """What is derived from the poses received so far."""
-
     tree: TransformTree
     topic: Track | None  # of the poses, if they are those of a topic
     find: FindPoses
@@ -203,7 +69,7 @@ class Subscription:
         stopped: Callable[[], bool],
         report: Callable[[str], None],
     ) -> None:
-        self._node, self._topics, self._request = node, list(dict.fromkeys(topics)), request
+        self.node, self._topics, self._request = node, list(dict.fromkeys(topics)), request
         self._stopped, self._report, self.unposed = stopped, report, find
         self._tracks = Tracks(_RecentTrack)
         self._frames: dict[str, str] = {}  # by topic of scans
@@ -211,7 +77,7 @@ class Subscription:
         self._readers: dict[str, tuple[str, Any]] = {}
         self._clocks: dict[str, Clock] = {}
         self._error: Exception | None = None
-        self._queue: deque[tuple[float, RawScan]] = deque(maxlen=_QUEUED * len(self._topics))
+        self._queue: deque[tuple[float, RawScan]] = deque(maxlen=QUEUED * len(self._topics))
         self.dropped = 0  # scans that arrived faster than they were taken, or before the mountings
         self.unplaced = 0  # scans without a pose
         self._lock = threading.RLock()
@@ -326,9 +192,9 @@ class Subscription:
                     return
             if time.monotonic() > report_s:
                 report_s = np.inf
-                found = self._node.published()
+                found = self.node.published()
                 listed = ", ".join(f"{name} ({', '.join(types)})" for name, types in sorted(found.items()))
-                self._report(f"waiting for {why}; DDS domain {self._node.domain} has {listed or 'no topics'}")
+                self._report(f"waiting for {why}; DDS domain {self.node.domain} has {listed or 'no topics'}")
             self._wait()
 
     def _missing(self, *, late: bool) -> str:
@@ -359,7 +225,7 @@ class Subscription:
                     self._subscribe()
                     next_s = time.monotonic() + 0.2
                 for topic, (message_type, reader) in self._readers.items():
-                    for sample in reader.take(_QUEUED):
+                    for sample in reader.take(QUEUED):
                         if sample.sample_info.valid_data:
                             self._receive(topic, message_type, sample)
                 time.sleep(_STEP_S)
@@ -371,13 +237,13 @@ class Subscription:
         wanted |= dict.fromkeys(self._topics, bag_messages.CLOUD_TYPES)
         if self._request.pose_topic is not None:
             wanted[self._request.pose_topic] = bag_messages.POSE_TYPES
-        found = self._node.published()
+        found = self.node.published()
         for topic in (wanted.keys() & found.keys()) - self._readers.keys():
             fitting = sorted(found[topic].keys() & set(wanted[topic]))
             listed = ", ".join(sorted(found[topic]))
             check(fitting, f"{topic} has messages {listed}; it must have one of {', '.join(wanted[topic])}")
             kind = fitting[0]
-            reader = self._node.reader(topic, kind, reliable=found[topic][kind], latched=topic == _STATIC)
+            reader = self.node.reader(topic, kind, reliable=found[topic][kind], latched=topic == _STATIC)
             self._readers[topic] = kind, reader
 
     def _receive(self, topic: str, message_type: str, sample: Any) -> None:
