@@ -26,7 +26,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import SLOW_TURN_RAD_S, Drive, Tracked, rates_of
+from radarsdf.poses.tracking import SLOW_TURN_RAD_S, Drive, Rates, Tracked, rates_of
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
 from scipy.stats import t as student
@@ -170,21 +170,22 @@ def test_rates_of_a_step_lead_to_the_next_one():
     speed = np.array([6.0, 1, -1])
     pose = before @ transform(turn, rotation(0.5 * turn) @ speed * duration_s)
     covariance = spread(7, 6)
-    turning, moving = rates_of(before, Tracked(pose, covariance, 1.0, 0, turn), duration_s)
+    rates = rates_of(before, Tracked(pose, covariance, 1.0, 0, turn), duration_s)
+    turning, moving, _ = rates
     assert_allclose(turning.mean, turn / duration_s)
     assert_allclose(moving.mean, speed)
     R, half = before[:3, :3], before[:3, :3] @ rotation(0.5 * turn)
     assert_allclose(turning.covariance, R.T @ covariance[3:, 3:] @ R / duration_s**2)
     assert_allclose(moving.covariance, half.T @ covariance[:3, :3] @ half / duration_s**2)
     drive = Drive([np.zeros((0, 3))] * 3, np.array([0.0, 0.2, 0.5]), None)
-    next_step = drive.predict(2, (turning, moving))
-    rate = drive.turns.after(turning, 0.25)
+    next_step = drive.predict(2, rates)
+    rate = drive.turns.after(turning, 0.275)
     assert_allclose(next_step.turn.mean, 0.3 * rate.mean)
     assert_allclose(next_step.turn.covariance, 0.09 * rate.covariance)
     assert_allclose(next_step.begin_mps, speed)
-    expected = (moving.covariance + 0.25 * np.diag(drive.moves.change)) * 0.09
+    expected = (moving.covariance + 0.275 * np.diag(drive.moves.change)) * 0.09
     assert_allclose(next_step.translation_covariance, expected)
-    assert drive.predict(1, (None, None)).duration_s == 0.2
+    assert drive.predict(1, Rates()).duration_s == 0.2
     assert drive.usual_turn_rad_s == pytest.approx(0.3)
     fast = dataclasses.replace(drive, velocities=velocities_of(np.tile([0, 25.0, 0], (3, 1)), np.eye(3)))
     assert fast.usual_turn_rad_s == pytest.approx(2 / 25)

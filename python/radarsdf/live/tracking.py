@@ -65,8 +65,7 @@ class Step:
     # Relative difference of the motion that the returns show from that by Doppler. NaN if unknown.
     pull: float = np.nan
     sign: int = 0  # sign of the Doppler as known then: -1 if positive for approaching objects, 0 if unknown
-    rates: Rates = None, None  # since the previous scan of its radar
-    rates_s: float = 0.0  # time since then. 0: unknown
+    rates: Rates = dataclasses.field(default_factory=Rates)  # since the previous scan of its radar
 
     @property
     def time_s(self) -> float:
@@ -281,7 +280,7 @@ class Follower:
         turn = rotation_vector(first[:3, :3].T @ step.found.pose[:3, :3], turn)
         covariance = np.sum([one.covariance for one in since], axis=0)
         found = dataclasses.replace(step.found, turn=turn, covariance=covariance)
-        return dataclasses.replace(step, rates=rates_of(first, found, duration_s), rates_s=duration_s)
+        return dataclasses.replace(step, rates=rates_of(first, found, duration_s))
 
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
         if logged.doppler_mps is None:
@@ -294,20 +293,20 @@ class Follower:
     def _next(self, new: Step, sign: int) -> Step:
         """Register a scan from the previous one."""
         steps = [*list(self._steps)[-2 * self.num_radars :], new]
-        known = [step for step in self._of_radar(new)[1:-1] if step.rates_s]
-        durations_s = np.array([step.rates_s for step in known])
+        known = [step.rates for step in self._of_radar(new)[1:-1] if step.rates.duration_s]
+        durations_s = np.array([rates.duration_s for rates in known])
         # Short steps of a rig follow the prior: without their errors, it would shrink to nothing.
-        turns = TURNS.learnt([step.rates[0] for step in known], durations_s, with_errors=self.num_radars > 1)
-        moves = MOVES.learnt([step.rates[1] for step in known], durations_s)
+        turns = TURNS.learnt([rates.turn for rates in known], durations_s, with_errors=self.num_radars > 1)
+        moves = MOVES.learnt([rates.move for rates in known], durations_s)
         scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
         drive = Drive(scans, times_s, self._velocities(steps, sign), turns, moves, rig=_rig_of(steps))
-        rates = steps[-2].rates, steps[-2].rates_s
-        expected = drive.predict(len(steps) - 1, *rates)
+        expected = drive.predict(len(steps) - 1, steps[-2].rates)
         found = self._tracker.register(drive.scans[-1], expected)
         if drive.rig is None and drive.velocities is not None and sign and not found.agreeing > 0:
             # A sensor that turns faster than predicted was dead-reckoned, or lost.
             _, yaws = sign_significance(drive.scans, drive.velocities, drive.times_s)
-            expected = dataclasses.replace(drive, yaws=yaws, turns=TURNS).predict(len(steps) - 1, *rates)
+            searched = dataclasses.replace(drive, yaws=yaws, turns=TURNS)
+            expected = searched.predict(len(steps) - 1, steps[-2].rates)
             found = self._tracker.register(drive.scans[-1], expected)
         unknown = drive.velocities is None or found.segment > 0
         pull = np.nan if unknown else _pull(steps[-2].found, found, expected)

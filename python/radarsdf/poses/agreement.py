@@ -142,8 +142,9 @@ class Agreement:
     def _both_ways(self, i: int, j: int, T_j_i: Floats) -> Iterator[tuple[Floats, _Indexed]]:
         """Yield the returns (H, M, 3) of each of two scans in the frame of the other one, and this one."""
         for k, other, T in ((i, j, T_j_i), (j, i, np.asarray(np.linalg.inv(T_j_i), np.float64))):
-            points = np.einsum("hab,nb->hna", T[:, :3, :3], self._of(k).queries) + T[:, None, :3, 3]
-            yield points, self._of(other)
+            # Summed along the returns: along their three coordinates takes 40 times as long.
+            points = np.einsum("hab,bn->han", T[:, :3, :3], self._of(k).queries.T) + T[:, :3, 3:]
+            yield points.swapaxes(1, 2), self._of(other)
 
     def _of(self, i: int) -> _Indexed:
         if i not in self._indexed:

@@ -342,11 +342,11 @@ class Consistency:
 class _Pairs:
     """K pairs of scans, and how well their returns agree with hypotheses of the motion between them."""
 
-    # (K, S) how much nearer returns are after scales of the Doppler's step than after the reverse.
+    # (K, S) how much nearer returns are after scales of the Doppler's step than after the reverse. NaN if slow
     gains: Floats
-    # (K, T) how much nearer they are without a step than after shifts, of which the second half is opposite to the first.
+    # (K, T) how much nearer they are without a step than after shifts, of which the second half is opposite to the first. NaN if not slow
     losses: Floats
-    moved: Floats  # (K,) how much nearer they are after the Doppler's step than without one
+    moved: Floats  # (K,) how much nearer they are after the Doppler's step than without one. NaN if slow
     along: Floats  # (K,) relative differences of tracked steps and Doppler. NaN where returns hardly observe them
     slow: Bools  # (K,) whether there is no motion by Doppler
 
@@ -358,18 +358,21 @@ class _Pairs:
 
         `yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
         """
-        scales, agreement, apart = len(_SCALES), of_neighbours(scans, _SAMPLED), []
-        for i in rows.tolist():
+        scales, agreement = len(_SCALES), of_neighbours(scans, _SAMPLED)
+        slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
+        apart = np.full((len(rows), 2 * scales + 1 + len(_SHIFTS_M)), np.nan)
+        for i, own, still in zip(rows.tolist(), apart, slow.tolist(), strict=True):
             step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
-            shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])
+            # A pair without motion by Doppler decides no scale, and others need no shifts.
+            tried = slice(2 * scales, None) if still else slice(2 * scales + 1)
+            shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])[tried]
             turns = [motion.steps[i, :3, :3]]
             if yaws is not None and np.isfinite(yaws[i]):
                 turns.append(rotation(np.array([0.0, 0.0, yaws[i]])))
             both = [assembled(np.tile(turn, (len(shifts_m), 1, 1)), shifts_m) for turn in turns]
-            apart.append(np.min([agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both], axis=0))
-        ahead, back, still, shifted = np.split(np.array(apart), np.cumsum([scales, scales, 1]), axis=1)
-        slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
-        return cls(back - ahead, shifted - still, still[:, 0] - ahead[:, _SAME], along[rows], slow)
+            own[tried] = np.min([agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both], axis=0)
+        ahead, back, unmoved, shifted = np.split(apart, np.cumsum([scales, scales, 1]), axis=1)
+        return cls(back - ahead, shifted - unmoved, unmoved[:, 0] - ahead[:, _SAME], along[rows], slow)
 
     def select(self, rows: slice | Bools) -> "_Pairs":
         return _Pairs(*(column[rows] for column in vars(self).values()))

@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -167,7 +168,13 @@ LATERAL_MPS2 = 2.0
 SLOW_TURN_RAD_S = 0.1
 _GYROSCOPE_RAD = 0.003  # initial deviation of a step's rotation by a gyroscope
 
-Rates = tuple[MotionRate | None, MotionRate | None]  # rotation, rad/s, and translation, m/s, if known
+
+class Rates(NamedTuple):
+    """Rates of a step, in the sensor frame."""
+
+    turn: MotionRate | None = None  # rad/s. None: unknown
+    move: MotionRate | None = None  # m/s
+    duration_s: float = 0.0  # of the step. 0: unknown
 
 
 @dataclass(frozen=True)
@@ -187,16 +194,14 @@ class Drive:
     yaws: Floats | None = None  # as :attr:`CheckedScans.yaws`
     rig: Rig | None = None  # of several radars. The poses are those of its body
 
-    def predict(self, i: int, rates: Rates, before_s: float | None = None) -> PredictedStep:
-        """Predict the step to scan `i` from the rates until the scan before it, of its step or of the duration `before_s`."""
+    def predict(self, i: int, rates: Rates) -> PredictedStep:
+        """Predict the step to scan `i` from the rates of one that ends at the scan before it."""
         duration_s = float(self.times_s[i] - self.times_s[i - 1])
-        if before_s is None:
-            before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
-        elapsed_s = (duration_s + before_s) / 2
+        elapsed_s = (duration_s + rates.duration_s) / 2
         if self.inertial.gyroscope is not None:
             turned = self.inertial.gyroscope.step(i - 1)
         else:
-            turned = self.turns.after(rates[0], elapsed_s).integrate(duration_s)
+            turned = self.turns.after(rates.turn, elapsed_s).integrate(duration_s)
             if self.yaws is not None and np.isfinite(yaw := self.yaws[0, i - 1]):
                 before = turned.covariance.copy()
                 if self.turns is TURNS:  # not learnt yet, and expects slower turns
@@ -205,7 +210,7 @@ class Drive:
                 mean = turned.mean + gain * (yaw - turned.mean[2])
                 turned = MotionRate(mean, before - np.outer(gain, before[2]))
         if self.velocities is None:
-            velocity = self.moves.after(rates[1], elapsed_s)
+            velocity = self.moves.after(rates.move, elapsed_s)
             covariance = velocity.integrate(duration_s).covariance
             return PredictedStep(turned, velocity.mean, velocity.mean, covariance, duration_s)
         if isinstance(self.velocities, BodyVelocities):
@@ -263,7 +268,7 @@ def track_drive(
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
         tracked, rates = track_once(drive, Tracker(cell_m, config, drive.window))
-        turn_rates, move_rates = [turn for turn, _ in rates], [move for _, move in rates]
+        turn_rates, move_rates = [step.turn for step in rates], [step.move for step in rates]
         turns, moves = drive.turns, drive.moves
         if i == 0 and drive.usual_turn_rad_s < SLOW_TURN_RAD_S and tracked[-1].segment > 0:
             # Tracking was lost. Narrow the search of the next passes.
@@ -286,7 +291,7 @@ def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rate
     """Track all scans in one pass; return them, and the rates of each step."""
     tracked: list[Tracked] = []
     rates: list[Rates] = []
-    last: Rates = drive.first_turn, None
+    last = Rates(drive.first_turn)
     for i, scan in enumerate(drive.scans):
         predicted = drive.predict(i, last) if i else None
         now = Tracked(np.eye(4)) if predicted is None else tracker.register(scan, predicted)
@@ -294,19 +299,22 @@ def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rate
         if predicted is not None:
             before, duration_s = tracked[-1], predicted.duration_s
             if now.segment != before.segment:
-                last = None, None
-            elif duration_s > 0:  # else, two radars measured at once
+                last = Rates()
+            elif duration_s > 0:
                 last = rates_of(before.pose, now, duration_s)
+            else:  # two radars measured at once
+                last = last._replace(duration_s=0.0)
             rates.append(last)
         tracked.append(now)
     return tracked, rates
 
 
-def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRate, MotionRate]:
-    """Compute the rates of rotation and translation, in the sensor frame, of the step from pose `before` (4, 4)."""
+def rates_of(before: Floats, now: Tracked, duration_s: float) -> Rates:
+    """Compute the rates of the step from pose `before` (4, 4)."""
     back = before[:3, :3].T
     half = rotation(0.5 * now.turn).T @ back
     of_way = half @ now.covariance[:3, :3] @ half.T / duration_s**2
     of_turn = back @ now.covariance[3:, 3:] @ back.T / duration_s**2
     translation = half @ (now.pose[:3, 3] - before[:3, 3])
-    return MotionRate(now.turn / duration_s, of_turn), MotionRate(translation / duration_s, of_way)
+    move = MotionRate(translation / duration_s, of_way)
+    return Rates(MotionRate(now.turn / duration_s, of_turn), move, duration_s)
