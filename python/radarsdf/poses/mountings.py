@@ -25,33 +25,15 @@ _CELLS = (0, 0, 0, 2, 2, 1, 1, 1, 1, 1, 1, 1)
 _SIGMAS2 = 4.0  # squared scale of the Geman-McClure weight
 _BENT = 10.0  # most changes that count, medians: a straight path may bend at its ends, where an offset wrong by 70 ms was known to 3
 _SLOW = 0.001  # standard deviation of slowly changing errors of velocities, share of the speed
-_DIFFERENCE = 1e-3  # of numeric derivatives: m, rad, s
 _LEAST_CHANGE = 1e-3  # m/s and rad/s, between knots
+# Standard deviation of the prior of changes, relative to theirs. The most probable path is smoother than the true one: with 1, lever
+# arms were up to 0.4 m longer and a side radar rolled by 0.6 degrees. That error shrinks with the square of the factor.
+_LOOSE = 5.0
 
 
 def _variances(J: Any, covariance: Floats) -> Floats:
     """Return the diagonal (N,) of J C Jᵀ for a sparse J (N, U) and covariance C (U, U)."""
     return np.asarray(J.multiply(J @ covariance).sum(axis=1)).ravel()
-
-
-def _of_path_errors(
-    path: BodyPath, radars: equations.RadarsOfBody, whitening: Any, covariance: Floats
-) -> Floats:
-    """Return half the expected squares of the errors of velocities caused by those of the path, of covariance (U, U): their first and
-    second derivatives (2, K, 10) by lever arms, rotations and time offsets."""
-    K, count = len(path.mountings), len(covariance)
-
-    def expected(step: Floats) -> Floats:
-        moved_path = path.moved(np.append(np.zeros(count), np.tile(step, K)))
-        J = (whitening @ equations.velocity_rows(moved_path, radars)[1]).tocsr()[:, :count]
-        of_scans = _variances(J, covariance).reshape(-1, 3).sum(axis=1) / 2
-        return np.bincount(radars.of_scan, of_scans, K).astype(np.float64)
-
-    here, found = expected(np.zeros(OF_RADAR)), np.zeros((2, K, OF_RADAR))
-    for i, step in enumerate(_DIFFERENCE * np.eye(7, OF_RADAR)):
-        above, below = expected(step), expected(-step)
-        found[:, :, i] = (above - below) / (2 * _DIFFERENCE), (above - 2 * here + below) / _DIFFERENCE**2
-    return found
 
 
 def estimate_mountings(
@@ -75,8 +57,11 @@ def estimate_mountings(
         robust = 1 / (1 + (off_mps**2).sum(axis=1) / (3 * _SIGMAS2))
         whitening = equations.block_diagonal(robust[:, None, None] * radars.whitening)
         changes, smooth = equations.smooth_rows(path)
-        weights = sparse.diags(np.tile(1 / spread, len(smooth)))
-        rows = [(whitening @ of_velocities, robust[:, None] * off_mps), (weights @ changes, smooth / spread)]
+        weights = sparse.diags(np.tile(1 / (_LOOSE * spread), len(smooth)))
+        rows = [
+            (whitening @ of_velocities, robust[:, None] * off_mps),
+            (weights @ changes, smooth / (_LOOSE * spread)),
+        ]
         for J, residual in rows if steps is None else [*rows, equations.step_rows(path, *steps)]:
             H, g = H + J.T @ J, g + J.T @ residual.ravel()
         if cells:
@@ -85,17 +70,9 @@ def estimate_mountings(
             covariance = splu(H[:num_path, :num_path].tocsc()).solve(np.eye(num_path))
             of_errors = _variances(changes[:, :num_path], covariance).reshape(-1, 6)
             spread = np.sqrt((smooth**2 + of_errors).mean(axis=0)) + _LEAST_CHANGE
-        observed = H
-        if cells == _CELLS[-1]:
-            # The most probable path is smoother than the true one, which lengthened lever arms by up to 0.4 m. So they are
-            # estimated for all paths that the data leave possible: the marginal likelihood, by the method of Laplace.
-            slope, curvature = _of_path_errors(path, radars, whitening, covariance)
-            g[num_path:] += slope.ravel()
-            H = H + sparse.diags(np.append(np.zeros(num_path), np.maximum(curvature, 0.0)))
         path = path.moved(-splu(H.tocsc()).solve(g))
-    # Curvature speeds convergence, but observes nothing.
     of_radars = np.eye(len(held), K * OF_RADAR, -num_path)
-    blocks = splu(observed.tocsc()).solve(of_radars)[num_path:].reshape(K, OF_RADAR, K, OF_RADAR)
+    blocks = splu(H.tocsc()).solve(of_radars)[num_path:].reshape(K, OF_RADAR, K, OF_RADAR)
     covariance = np.stack([blocks[k, :7, k, :7] for k in range(K)])
     # Errors of velocities that change slowly pass for a delay where the speed changes slowly.
     at_s, apart_s = np.linspace(0.0, radars.times_s[-1], 2 * len(path.positions), retstep=True)

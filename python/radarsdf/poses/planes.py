@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import eigh, lapack
 from scipy.spatial import cKDTree
 
-from radarsdf.arrays import Bools, Floats, Floats32, Ints32
+from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.core import CellBlocks, CommonPlanes, LocalPlanes
 from radarsdf.poses.rigid import increments, moved
@@ -24,6 +24,7 @@ _DOUBLINGS = 4
 # Width of the factored band, scans. 16 to 128 take the same time, since fewer need more iterations.
 _TOGETHER = 32
 _LEAST_RANGE_M = 1e-6  # against division by zero
+_LEAST_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, against division by zero
 # Cells are at least a quarter of the spacing of returns in a scan: with 40 returns over 150 m, smaller cells have too few. Radars
 # of 500 to 2,000 returns a scan have a spacing of 0.2 to 0.5 m, so that their cells are those of a map.
 _CELLS_APART = 4
@@ -181,8 +182,23 @@ def common_planes(
     return CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, noise.of_scans(rays), *together), noise
 
 
-def planes_of(rays: Rays, surfels: Surfels, num_threads: int) -> Ints32:
-    """Return the flat surfel (N,) of each return: that of the cell of its projection onto the surface; -1: none."""
+def errors_with(rays: Rays, rows: Ints, normals: Floats32 | Floats, noise: SensorNoise) -> Floats:
+    """Return the errors (K, 3) of returns `rows` (K,) to expect from an error of 1 along `normals` (K, 3)."""
+    directions, ranges_m = rays.directions[rows].astype(np.float64), rays.ranges_m[rows, None]
+    across = np.cross(rays.up_of_scan[rays.scans[rows]], directions)
+    across /= np.maximum(np.linalg.norm(across, axis=1), _LEAST_SINE)[:, None]
+    along, aside = (np.einsum("ni,ni->n", axes, normals)[:, None] * axes for axes in (directions, across))
+    variances = noise.of_scans(rays)[rays.scans[rows]].T[:, :, None]
+    angular = variances[1] * aside + variances[2] * (normals - along - aside)
+    errors = variances[0] * along + ranges_m**2 * angular
+    return np.asarray(errors / np.einsum("ni,ni->n", errors, normals)[:, None])
+
+
+def planes_of(rays: Rays, surfels: Surfels, num_threads: int, noise: SensorNoise | None = None) -> Ints32:
+    """Return the flat surfel (N,) of each return: that of the cell of its projection onto the surface; -1: none.
+
+    With `noise`, the projection is the most probable position, which is independent of the distance from the surface.
+    """
     # Noise moves returns across surfaces into other cells. By the cells of the returns themselves, it would be truncated at cell
     # borders, differently for near and far returns, and rotate poses.
     points = rays.points
@@ -190,7 +206,8 @@ def planes_of(rays: Rays, surfels: Surfels, num_threads: int) -> Ints32:
     on = np.flatnonzero(planes >= 0)
     normals = surfels.normals[planes[on]]
     off = np.einsum("ni,ni->n", points[on] - surfels.centres[planes[on]], normals)
-    feet = np.ascontiguousarray(points[on] - (off[:, None] * normals).astype(np.float32))
+    along = normals if noise is None else errors_with(rays, on, normals, noise)
+    feet = np.ascontiguousarray(points[on] - (off[:, None] * along).astype(np.float32))
     beneath = surfels.flat_planes_at(feet, num_threads)
     planes[on] = np.where(beneath >= 0, beneath, planes[on])
     # The faces of a wall may share a cell. As one surface, those of a hall made a lap round them 1 % smaller.
