@@ -123,12 +123,9 @@ def _child(library: Path) -> None:
         with ThreadPool(1) as pool:
             field = NeuralField(leaf_keys, config, with_intensity=scale is not None, num_threads=1)
             field.initialise(torch.Generator().manual_seed(0))
-            sizes_of_data = {
-                "surface_returns": len(rays),
-                "returns": len(rays),
-                "vertices": field.table.num_rows,
-            }
-            schedule = Schedule.of(config, with_intensity=scale is not None, **sizes_of_data)
+            sizes_of_data = {"surface_returns": len(rays), "vertices": field.table.num_rows}
+            labelled = [] if scale is None else [len(rays)]
+            schedule = Schedule.of(config, **sizes_of_data, labelled=labelled)
             training = Training(field, rays, rays, scale, schedule, config, pool)
             _count_steps(training, name.encode(), switch)
             training.run(progress=False)

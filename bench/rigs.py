@@ -62,37 +62,40 @@ def _of(scans: Scans, labels: Sequence[Label]) -> Scans:
 
 
 def fit(options: argparse.Namespace) -> Iterator[Row]:
-    """Yield a row per scene, seed and method: F-score, and errors of held-out intensities of each radar."""
+    """Yield a row per scene, seed and method: F-score, and errors of held-out intensities of each radar.
+
+    All methods have the same returns: with Doppler, only that of the rig would leave out those that move, a tenth.
+    """
     for base, drive, seed in _drives(options):
         radars = three_radars(drive.sensor)
-        scans = _driven(drive, radars, seed).scans
+        own = _driven(drive, radars, seed).scans
+        arrays = own.points, own.poses, own.intensities, own.ground_truth
+        scans = Scans(*arrays, sensors=own.sensors, T_body_sensor=own.T_body_sensor)
         train, test = (scans.select(rows) for rows in holdout(len(scans)))
         config = FitConfig(num_threads=options.threads[0], **(QUICK if options.quick else {}))
 
-        def fitted(own: Any, *arrays: Any, config: FitConfig = config) -> RadarMap:
-            return radarsdf.fit(own, *arrays, config=config, progress=False)
+        def fitted(own: Scans, config: FitConfig = config) -> RadarMap:
+            return radarsdf.fit(own, config=config, progress=False)
 
         with mock.patch.object(noise, "sensor_noise", _true_noise([*radars.values()])):
             true = fitted(_in_one_unit(train, drive, radars))
-        one = fitted(train.points, train.sensor_poses, train.intensities)
-        for method, found in (("rig", fitted(train)), ("true noise and gains", true), ("one sensor", one)):
+        rig, one = fitted(train), fitted(Scans(train.points, train.sensor_poses, train.intensities))
+        methods = ("rig", "one sensor", "each radar alone", "true noise and gains")
+        rows: dict[str, Row] = {method: {} for method in methods}
+        for label in _LABELS:
+            alone, held_out = fitted(_of(train, [label])), _of(test, [label])
+            maps: list[tuple[RadarMap, Row]] = [(rig, {"sensor": label}), (one, {}), (alone, {})]
+            predicted = [_predicted(found, held_out, **of_rig) for found, of_rig in maps]
+            errors = _intensity_errors(predicted, held_out)
+            for method, error in zip(methods[:3], errors, strict=True):
+                rows[method][label] = error
+        for method, found in zip((*methods[:2], methods[3]), (rig, one, true), strict=True):
             mesh = found.mesh(0.1, progress=False)
             assert scans.ground_truth is not None
-            metrics = surface_metrics(
-                mesh, scans.ground_truth, samples=10_000 if options.quick else 2_000_000
-            )
-            row = base | {"method": method, "f_score": metrics["f_score"]}
-            if method == "true noise and gains":
-                yield row
-                continue
-            for label in _LABELS:
-                of_rig = {"sensor": label} if method == "rig" else {}
-                row[label] = _intensity_error(found, _of(test, [label]), **of_rig)
-            yield row
-        alone = {label: _of(train, [label]) for label in _LABELS}
-        maps = {label: fitted(own.points, own.poses, own.intensities) for label, own in alone.items()}
-        errors = {label: _intensity_error(found, _of(test, [label])) for label, found in maps.items()}
-        yield base | {"method": "each radar alone", **errors}
+            samples = 10_000 if options.quick else 2_000_000
+            rows[method]["f_score"] = surface_metrics(mesh, scans.ground_truth, samples=samples)["f_score"]
+        for method, row in rows.items():
+            yield base | {"method": method} | row
 
 
 def _true_noise(radars: Sequence[MountedRadar]) -> Callable[..., noise.SensorNoise]:
@@ -116,18 +119,22 @@ def _in_one_unit(scans: Scans, drive: Simulation, radars: dict[str, MountedRadar
     gains = {label: radar.sensor.gain_db - drive.sensor.gain_db for label, radar in radars.items()}
     pairs = zip(scans.intensities, scans.sensors, strict=True)
     same = [values - np.float32(gains[str(label)]) for values, label in pairs]
-    of_rig: Row = {"sensors": scans.sensors, "T_body_sensor": scans.T_body_sensor}
-    return Scans(scans.points, scans.poses, same, doppler_mps=scans.doppler_mps, **of_rig)
+    return Scans(scans.points, scans.poses, same, sensors=scans.sensors, T_body_sensor=scans.T_body_sensor)
 
 
-def _intensity_error(found: RadarMap, test: Scans, **of_rig: Any) -> float | None:
-    """Mean absolute error of the intensities of held-out scans of one radar, dB; None if the map has none there."""
-    assert test.intensities is not None
+def _predicted(found: RadarMap, test: Scans, **of_rig: Any) -> Floats:
     lengths = [len(points) for points in test.points]
     x = np.concatenate([scan.world_points for scan in test])
-    predicted = found.intensity(x, np.repeat(test.poses[:, :3, 3], lengths, axis=0), **of_rig)
-    measured, seen = np.concatenate(test.intensities), np.isfinite(predicted)
-    return float(intensity_metrics(predicted[seen], measured[seen])["mae"]) if seen.any() else None
+    return found.intensity(x, np.repeat(test.poses[:, :3, 3], lengths, axis=0), **of_rig)
+
+
+def _intensity_errors(predicted: Sequence[Floats], test: Scans) -> list[float | None]:
+    """Mean absolute errors, dB, of the intensities of held-out scans of one radar, at returns where no map has NaN; None without."""
+    assert test.intensities is not None
+    measured, seen = np.concatenate(test.intensities), np.isfinite(predicted).all(axis=0)
+    if not seen.any():
+        return [None] * len(predicted)
+    return [float(intensity_metrics(own[seen], measured[seen])["mae"]) for own in predicted]
 
 
 def drift(options: argparse.Namespace) -> Iterator[Row]:

@@ -71,9 +71,8 @@ def test_whole(benchmark, stage, steps, rays, leaf_keys):
         }
     )
     count, vertices = len(rays), field.cells.table.num_rows
-    schedule = Schedule.of(
-        config, surface_returns=count, returns=count, vertices=vertices, with_intensity=scale is not None
-    )
+    labelled = [] if scale is None else [count]
+    schedule = Schedule.of(config, surface_returns=count, vertices=vertices, labelled=labelled)
     losses = []
 
     def setup():

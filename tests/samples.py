@@ -61,9 +61,8 @@ def training() -> Training:
     field = NeuralField(keys, config, with_intensity=True, num_threads=1)
     field.initialise(torch.Generator().manual_seed(0))
     count = len(rays)
-    schedule = Schedule.of(
-        config, surface_returns=count, returns=count, vertices=field.table.num_rows, with_intensity=True
-    )
+    vertices = field.table.num_rows
+    schedule = Schedule.of(config, surface_returns=count, vertices=vertices, labelled=[count])
     return Training(field, rays, rays, scale, schedule, config, ThreadPool(1))
 
 

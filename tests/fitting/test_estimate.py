@@ -78,7 +78,8 @@ def test_a_dry_run_prints_and_writes_nothing(scene, tmp_path, capsys, monkeypatc
 
 def skipped_of(config, with_intensity):
     sizes = {"returns": 500_000, "with_intensity": with_intensity}
-    schedule = Schedule.of(config, surface_returns=sizes["returns"], vertices=10**9, **sizes)
+    labelled = [sizes["returns"]] * with_intensity
+    schedule = Schedule.of(config, surface_returns=sizes["returns"], vertices=10**9, labelled=labelled)
     found = estimate.skipped_parts(config, schedule, cells=10**6, rows=10**6, **sizes)
     return schedule, dict(found)
 

@@ -126,9 +126,8 @@ def test_frozen_geometry_is_unchanged(scene):
 
 def schedule(returns, vertices=10**9, *, with_intensity=True, **changes):
     config = FitConfig(**grouped(**changes))
-    return Schedule.of(
-        config, surface_returns=returns, returns=returns, vertices=vertices, with_intensity=with_intensity
-    )
+    labelled = [returns] * with_intensity
+    return Schedule.of(config, surface_returns=returns, vertices=vertices, labelled=labelled)
 
 
 @pytest.mark.parametrize(
@@ -156,6 +155,14 @@ def test_iterations_are_limited_by_the_number_of_vertices():
     assert schedule(10**6, vertices=100_000).sdf_iterations == 300
     assert schedule(10**6, vertices=300_000).sdf_iterations == pytest.approx(10 * 300_000 / 4096, abs=1)
     assert schedule(10**6, vertices=100).sdf_iterations == 150
+
+
+def test_each_radar_of_a_rig_has_the_intensity_iterations_of_a_fit_of_its_own():
+    def of(*labelled):
+        found = Schedule.of(FitConfig(), surface_returns=sum(labelled), vertices=10**9, labelled=[*labelled])
+        return found.intensity_iterations
+
+    assert of(10**5, 2 * 10**5, 0, 10**6) == of(10**5) + of(2 * 10**5) + of(10**6)
 
 
 def test_batches_grow_to_limit_iterations():

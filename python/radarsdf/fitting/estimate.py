@@ -66,10 +66,8 @@ class Schedule:
     dropout_scale: float = 0.0  # factor on the dropout
 
     @classmethod
-    def of(
-        cls, config: FitConfig, *, surface_returns: int, returns: int, vertices: int, with_intensity: bool
-    ) -> "Schedule":
-        """Compute the schedule for `surface_returns` returns without ghosts, and `returns` with them."""
+    def of(cls, config: FitConfig, *, surface_returns: int, vertices: int, labelled: list[int]) -> "Schedule":
+        """Compute the schedule. `labelled`: numbers of returns of each radar, ghosts included; empty without their network."""
         if not config.train:
             return cls()
         training = config.training
@@ -79,16 +77,18 @@ class Schedule:
             batch_size, iterations = _sdf_schedule(config, samples, vertices)
         neighbours = _NEIGHBOURS if min(vertices, surface_returns) > _ROWS_IN_CACHES else 1
         surface = (batch_size, neighbours, iterations, iterations * batch_size / samples)
-        if not with_intensity:
+        if not labelled:
             return cls(*surface)
-        samples = returns * NEAR_SAMPLES
+        samples = sum(labelled) * NEAR_SAMPLES
         intensity_batch_size = training.intensity_batch_size
         joint_iterations, intensity_iterations = iterations, training.intensity_iterations
         if intensity_iterations is None:
             joint_iterations = min(iterations, max(1, round(config.effort * _MOST_JOINT_ITERATIONS)))
             intensity_batch_size = min(intensity_batch_size, samples)
-            wanted = math.ceil(_INTENSITY_PASSES * samples / training.intensity_batch_size)
-            wanted = min(max(wanted, _LEAST_INTENSITY_ITERATIONS), _MOST_INTENSITY_ITERATIONS)
+            size, most = training.intensity_batch_size, _MOST_INTENSITY_ITERATIONS
+            # Radars see a place from different sides: each of a rig gets the iterations of a fit of its returns alone.
+            of_radars = [math.ceil(_INTENSITY_PASSES * (n * NEAR_SAMPLES) / size) for n in labelled if n]
+            wanted = sum(min(max(own, _LEAST_INTENSITY_ITERATIONS), most) for own in of_radars)
             alone = max(wanted - joint_iterations, _LEAST_INTENSITY_STAGE)
             intensity_iterations = max(1, joint_iterations + round(config.effort * alone))
         if training.intensity_in_free_space:  # the samples are those of the sdf stage
@@ -222,8 +222,8 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
     of_dense, of_sparse = _ROWS[config.encoding.kind] if config.train else _ROWS_AVERAGED
     rows = round(cells * (of_dense + of_sparse * sparse**6))
     with_network = rays.intensities is not None and config.trains_intensity
-    sizes = {"surface_returns": returns, "returns": returns, "vertices": rows}
-    schedule = Schedule.of(config, with_intensity=with_network, **sizes)
+    labelled = [returns // rays.num_sensors] * rays.num_sensors if with_network else []
+    schedule = Schedule.of(config, surface_returns=returns, vertices=rows, labelled=labelled)
     memory = _ALWAYS + returns * _PER_RETURN + cells * (_PER_CELL if config.train else _PER_CELL_AVERAGED)
     if config.train:
         # Gradients of all rows, unless only touched rows move; with normals two for each thread, and their sum.
@@ -274,8 +274,7 @@ def skipped_parts(
 
     def seconds(network: bool, **changes: Any) -> float:
         changed = config.override(**changes)
-        sizes = {"surface_returns": returns, "returns": returns, "vertices": rows}
-        scheduled = Schedule.of(changed, with_intensity=network, **sizes)
+        scheduled = Schedule.of(changed, surface_returns=returns, vertices=rows, labelled=[returns] * network)
         return seconds_of(changed, scheduled, returns, cells, rows)
 
     network = with_intensity and config.trains_intensity
