@@ -121,7 +121,8 @@ class JointEstimator:
         found = self.estimate(given, far=far, progress=progress, anchor=anchor)
         for visit in visits(self.returns.median_range_m, found.poses):
             planes = PlaneMap(self.cell_m, found.noise.variances)
-            start = close_loop(self.returns, found.poses, visit, planes, self.config.num_threads)
+            prior = np.sum([found.covariance[scans].mean(axis=0) for scans in visit], axis=0)
+            start = close_loop(self.returns, found.poses, visit, prior, planes, self.config.num_threads)
             if start is None:
                 continue
             closed = self.estimate(start, anchor=anchor)
