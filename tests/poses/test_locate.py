@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.poses.rigid import increments, moved
+from radarsdf.poses.rigid import increments, moved, transform
 from radarsdf.simulate import hugin
 
 from scenes.kinds import KINDS
 from scenes.revisits import SYMMETRIC, another_day, sessions, weaker
+from scenes.rigs import drive_of_rig
 
 from ..conftest import recorded_file
 from .drift import first as first_scans
@@ -182,10 +183,19 @@ def test_sessions_are_joined_or_apart():
     found = radarsdf.join(together)
     assert found.report["joined"] == [0, 1, 2]
     for poses, day in zip(found.poses, of_place.together, strict=True):
-        assert np.median(errors(poses, day.poses)[0]) < 0.15
+        assert np.median(errors(poses, day.poses)[0]) < 0.05
+    assert errors(found.poses[0], of_place.together[0].poses)[0].max() < 1e-2  # true poses do not bend
     found = radarsdf.join([scans(day, posed=False).select(range(FEW)) for day in of_place.apart])
     assert found.verdicts[0, 1] != "joined"
     assert np.isnan(found.poses[1]).all()
+
+
+def test_sessions_of_a_rig_keep_their_true_poses():
+    days = [drive_of_rig(day, seed=i).scans for i, day in enumerate(sessions("hugin", 1).together[:2])]
+    away = transform(np.array([0, 0, 0.7]), np.array([5.0, -3.0, 0.4]))
+    found = radarsdf.join([days[0], days[1].with_poses(away @ days[1].poses)])
+    for poses, day in zip(found.poses, days, strict=True):
+        assert errors(poses, day.poses)[0].max() < 0.05
 
 
 def test_the_second_arc_of_a_recorded_roundabout():

@@ -1,6 +1,7 @@
 """Loops: whether returns of revisited places agree, and poses from which an estimate closes a loop."""
 
 from collections.abc import Iterator
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,8 +26,8 @@ _ERRORS = 3.0  # minimum agreement, standard errors
 _SCANS = 12  # of the visit: single ones match wrong planes
 # In median ranges: path before the visit of scans that do not count, path after the earlier visit and distance of scans that do.
 _BEFORE, _AFTER, _NEAR = 1.0, 2.0, 3.0
-_DRIFT = 0.05  # standard deviation relative to the path between the visits
 _PASSES = 3  # of Gauss-Newton, coarse to fine
+Visit: TypeAlias = tuple[Ints, Ints]  # scans of a later visit of a place, and of earlier ones
 
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
@@ -63,11 +64,11 @@ def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_
 
 
 def close_loop(
-    returns: SensorReturns, poses: Floats, visit: tuple[Ints, Ints], planes: PlaneMap, num_threads: int
+    returns: SensorReturns, poses: Floats, visit: Visit, prior: Floats, planes: PlaneMap, num_threads: int
 ) -> Floats | None:
     """Return the poses (F, 4, 4) with a visit registered with earlier scans, and the path to it bent. None if it is there already.
 
-    `planes`: an empty map, to which the earlier scans are added. The joint estimate from the returned poses closes the loop if it is one.
+    `prior` (6, 6): covariance of the drift. `planes`: empty, for the earlier scans. The joint estimate from the result closes the loop.
     """
     later, earlier = visit
     path_m, range_m = np.append(0.0, lengths_of_steps_m(poses).cumsum()), returns.median_range_m
@@ -88,7 +89,6 @@ def close_loop(
     planes.add(surfaces[0])
     scan = thin((surfaces[1] - own[:3, 3]) @ own[:3, :3])
     radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
-    prior = np.diag(np.repeat([_DRIFT * between_m, _DRIFT * between_m / radius_m], 3) ** 2)
     pose = own
     for _ in range(_PASSES):
         pose = planes.fit(scan, own, prior, pose).pose
@@ -101,7 +101,7 @@ def close_loop(
     return moved(poses, np.concatenate([moved_m, turned], axis=1))
 
 
-def visits(range_m: float, poses: Floats) -> Iterator[tuple[Ints, Ints]]:
+def visits(range_m: float, poses: Floats) -> Iterator[Visit]:
     """Yield the scans of each later visit of a place, and those of earlier ones, given the median range."""
     path_m = np.append(0.0, lengths_of_steps_m(poses).cumsum())
     _, first, part = np.unique(np.floor(path_m / (_PART * range_m)), return_index=True, return_inverse=True)

@@ -121,11 +121,12 @@ class JointEstimator:
         found = self.estimate(given, far=far, progress=progress, anchor=anchor)
         for visit in visits(self.returns.median_range_m, found.poses):
             planes = PlaneMap(self.cell_m, found.noise.variances)
-            start = close_loop(self.returns, found.poses, visit, planes, self.config.num_threads)
+            prior = np.sum([found.covariance[scans].mean(axis=0) for scans in visit], axis=0)
+            start = close_loop(self.returns, found.poses, visit, prior, planes, self.config.num_threads)
             if start is None:
                 continue
             closed = self.estimate(start, anchor=anchor)
-            if Verdict.of(*_held_out(self.returns, 0), found.poses, closed.poses, closed.noise).closed:
+            if Verdict.of(*held_out(self.returns, 0), found.poses, closed.poses, closed.noise).closed:
                 found = replace(closed, poses=aligned(closed.poses, given)) if anchor is None else closed
         return found
 
@@ -136,7 +137,7 @@ def _anchor_at(given: Floats, fixed: Bools, poses: Floats) -> tuple[Floats, Floa
     return information[:, :, None] * np.eye(6), information * increments(given, poses)
 
 
-def _held_out(returns: SensorReturns, seed: int) -> tuple[SensorReturns, SensorReturns]:
+def held_out(returns: SensorReturns, seed: int) -> tuple[SensorReturns, SensorReturns]:
     """Return the returns that are held out, and the others."""
     held = np.random.default_rng(seed).random(len(returns)) < _HELD_OUT
     return returns.select(held), returns.select(~held)
@@ -260,8 +261,7 @@ def refine_poses(
     if not rigid.all():
         notes += LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes
         scans = [scan if usable else scan[:0] for scan, usable in zip(scans, rigid, strict=True)]
-    limits = config.returns
-    returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
+    returns = SensorReturns.of(scans, config.returns.min_range_m, config.returns.max_range_m, rig)
     report: dict[str, Any] = {"scans": len(scans), "returns": len(returns), "notes": notes}
     if len(scans) < 2 or len(returns) == 0:
         report["verdict"] = "The given poses are kept: there are no two scans to compare."
@@ -271,7 +271,7 @@ def refine_poses(
     if velocities is not None:
         motions.append(DopplerMotion.by(velocities, times, given))
     cell_m = plane_cell_m(scans, config.leaf_size_m)
-    held, used = _held_out(returns, config.seed)
+    held, used = held_out(returns, config.seed)
     estimator = JointEstimator(used, motions, cell_m, config)
     found = estimator.estimate_closed(given, far=True, progress=progress, anchor=anchor)
     found.poses[kept] = given[kept]  # to the bit
