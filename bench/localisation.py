@@ -147,8 +147,10 @@ def _ours(index: SurfaceIndex, day: Simulation, motion: MeasuredMotion) -> Row:
         row |= {} if isinstance(error, radarsdf.Lost) else {"why_not": str(error)}
     else:
         row |= judged(found.poses, day.poses) | {"explained": float(np.nanmedian(found.explained))}
-        off = increments(day.poses, found.poses) / np.sqrt(np.einsum("fii->fi", found.covariance))
-        if row["verdict"] == "wrong" and np.nanmedian(np.abs(off).max(axis=1)) < 3:
+        known = found.segments >= 0
+        off = increments(day.poses[known], found.poses[known])
+        off /= np.sqrt(np.einsum("fii->fi", found.covariance[known]))
+        if row["verdict"] == "wrong" and np.median(np.abs(off).max(axis=1)) < 3:
             row["verdict"] = "unsure"
         row["track_ms"] = 1e3 * (whole.cpu_s - sum(searches_s)) / len(day)
     return row | {"search_s": sum(searches_s), "whole_s": whole.cpu_s}
