@@ -26,13 +26,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from scenes.kinds import KINDS
 
-__all__ = ["PLACES", "SYMMETRIC", "Sessions", "another_day", "sessions", "weaker"]
+__all__ = ["PLACES", "SYMMETRIC", "Sessions", "another_day", "scan_rate_hz", "sessions", "weaker"]
 
 Floats = NDArray[np.float64]
 
 _FRAMES = 24  # scans of another day
 _ASIDE_M = 1.0  # paths are free of solids to 1.2 m on each side
 _LAYOUT, _TRAJECTORY, _DAY = 2**31 + 1, 2**31 + 2, 2**31 + 4  # streams of random numbers that no scan uses
+_RATE_HZ = 10.0
+_JUMP_M = 5.0  # farthest that a vehicle drives between two scans, at 50 m/s
+_MOST_MPS2 = 8.0  # horizontal acceleration that tyres transmit
 _STAYS_M = 8.0  # radius of solids such as façades and the walls of halls, which stay
 _SHORT = replace(HUGIN_A4, max_range_m=20.0)
 _ELSEWHERE = 500  # added to the seed of a place for another one of its kind
@@ -80,6 +83,12 @@ def another_day(
     rng, last = generator(seed, _DAY), len(first) - 1
     begin = rng.uniform(0, 0.4)
     at = last * np.linspace(*(stretch or (begin, begin + 0.6)), _FRAMES)
+    steps_m = np.linalg.norm(np.diff(first.poses[:, :2, 3], axis=0), axis=1)
+    if (
+        steps_m.max() > _JUMP_M
+    ):  # stops of which the earlier drive has no scans between: pass them at constant speed
+        along_m = np.append(0.0, np.cumsum(steps_m))
+        at = np.interp(at / last * along_m[-1], along_m, np.arange(last + 1))
     xyz = np.stack([np.interp(at, np.arange(last + 1), first.poses[:, k, 3]) for k in range(3)], axis=1)
     rotations = Slerp(np.arange(last + 1), Rotation.from_matrix(first.poses[:, :3, :3]))(at)
     axes = rotations.as_matrix()
@@ -99,6 +108,12 @@ def another_day(
     scene = replace(first.scene, solids=[*compress(first.scene.solids, kept)])
     order = slice(None, None, -1 if reverse else 1)
     return simulate(scene, sensor or first.sensor, poses[order].copy(), name=first.name, seed=seed + 1000)
+
+
+def scan_rate_hz(drive: Simulation) -> float:
+    """Return the highest rate of scans, at most 10 Hz, at which a vehicle can make a drive. At 10 Hz, laps would take 2 to 5 g."""
+    changes_m = np.linalg.norm(np.diff(drive.poses[:, :2, 3], 2, axis=0), axis=1)
+    return float(min(_RATE_HZ, np.sqrt(_MOST_MPS2 / changes_m.max())))
 
 
 def _court(rng: np.random.Generator) -> tuple[list[Primitive], Path]:

@@ -363,9 +363,9 @@ class _Places:
         cls, index: SurfaceIndex, submap: OrientedPoints, num_threads: int, guess: Floats | None = None
     ) -> "_Places":
         """Register the first of the candidates, those that agree most, and the best elsewhere. The guess (4, 4) becomes the first place."""
+        starts = _shifted(index.candidates(submap, num_threads), submap.centre)
         chosen = np.random.default_rng(0).permutation(len(submap.points))[:_REGISTERED]
         points = submap.points[chosen] - submap.centre
-        starts = _shifted(index.candidates(submap, num_threads), submap.centre)
         given = np.zeros((0, 4, 4)) if guess is None else _shifted(guess[None], submap.centre)
         given[:, :3, 3] -= index.origin
         radius_m = max(submap.radius_m, 1.0)
