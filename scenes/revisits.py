@@ -84,9 +84,7 @@ def another_day(
     begin = rng.uniform(0, 0.4)
     at = last * np.linspace(*(stretch or (begin, begin + 0.6)), _FRAMES)
     steps_m = np.linalg.norm(np.diff(first.poses[:, :2, 3], axis=0), axis=1)
-    if (
-        steps_m.max() > _JUMP_M
-    ):  # stops of which the earlier drive has no scans between: pass them at constant speed
+    if steps_m.max() > _JUMP_M:  # between stops, the earlier drive has no scans: pass them at constant speed
         along_m = np.append(0.0, np.cumsum(steps_m))
         at = np.interp(at / last * along_m[-1], along_m, np.arange(last + 1))
     xyz = np.stack([np.interp(at, np.arange(last + 1), first.poses[:, k, 3]) for k in range(3)], axis=1)

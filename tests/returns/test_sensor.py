@@ -4,12 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+import radarsdf
+from radarsdf import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.evidence import ReturnsOfCells
-from radarsdf.returns.noise import NOISE_SETTINGS, SensorNoise, sensor_noise
+from radarsdf.returns.noise import NOISE_SETTINGS, SensorNoise, sensor_noise, without_false_deviations
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
+from radarsdf.scans import Scans
 
 from ..conftest import ground_and_wall, pose
 from .walls import a_wall
@@ -128,6 +131,44 @@ def test_given_noise_is_kept():
     assert noise.elevation_rad == pytest.approx(0.008, rel=0.35)
     known = {"range_noise_m": 0.5, "azimuth_noise_rad": 0.2, "elevation_noise_rad": 0.1}
     assert dataclasses.astuple(noise_of(rays, **known)) == pytest.approx((0.5, 0.2, 0.1))
+
+
+def stated_wall():
+    """Scans of a wall; every second has five times the noise; deviations of elevation are overstated 100 times."""
+    walls = [a_wall(scale * 0.03, scale * 0.003) for scale in (1, 5)]
+    points = [walls[i % 2][0][i] for i in range(8)]
+    sigmas = [np.tile([0.03, 0.003, 0.3], (len(p), 1)) * (1, 5)[i % 2] for i, p in enumerate(points)]
+    return points, walls[0][1], sigmas
+
+
+def test_stated_deviations_are_scaled_by_the_returns():
+    points, poses, sigmas = stated_wall()
+    rays = prepare(points, poses, sigmas=sigmas)
+    typical = noise_of(rays).deviations / np.median(np.concatenate(sigmas), axis=0)
+    assert typical == pytest.approx([1, 1, 0.01], rel=0.4)
+    precise = rays.scans % 2 == 0
+    weights = noise_of(rays).weights(rays)
+    assert np.median(weights[precise]) == pytest.approx(25 * np.median(weights[~precise]), rel=0.05)
+    kept = without_false_deviations(rays, LEAF_M, ReturnsConfig(), 1)
+    assert (kept.stated == rays.stated).all()
+
+
+def test_deviations_that_the_returns_contradict_are_left_out(caplog):
+    points, poses, sigmas = stated_wall()
+    rays = prepare(points, poses, sigmas=[*sigmas[1:], sigmas[0]])
+    assert without_false_deviations(rays, LEAF_M, ReturnsConfig(), 1).stated is None
+    assert "deviations stated by the sensor" in caplog.text
+
+
+def test_a_fit_weighs_returns_by_their_stated_deviations():
+    points, poses, sigmas = stated_wall()
+    for config in (FitConfig.quick(), FitConfig()):
+        off_m = []
+        for stated in (None, sigmas):
+            drive = Scans(points, poses, sigmas=stated)
+            x, y, z = radarsdf.fit(drive, config=config, progress=False).mesh(0.1).vertices.T
+            off_m.append(np.abs(x[(np.abs(y) < 4) & (z > 0.7) & (z < 3.5)] - 15).mean())
+        assert off_m[1] < 0.8 * off_m[0]
 
 
 def test_few_returns_fall_back_to_the_default():

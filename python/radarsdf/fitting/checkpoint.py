@@ -96,7 +96,7 @@ class Checkpoint:
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:
     digest = hashlib.blake2b(repr(scale).encode(), digest_size=16)
-    of_rig = () if rays.sensor_of_scan is None else (rays.scans, rays.sensor_of_scan)
+    of_rig = (rays.stated, *(() if rays.sensor_of_scan is None else (rays.scans, rays.sensor_of_scan)))
     for array in (rays.origin, rays.points, rays.directions, rays.ranges_m, rays.intensities, *of_rig):
         digest.update(b"-" if array is None else array.data if array.flags.c_contiguous else array.tobytes())
     return digest.hexdigest()

@@ -22,6 +22,7 @@ from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.moving import static_rays
+from radarsdf.returns.noise import SensorNoise, sensor_noise, without_false_deviations
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.reflectance import Reflectance
@@ -50,7 +51,7 @@ def fit(
     ----------
     points : iterable of F arrays, or Scans
         (N_i, 3) each: the returns of one scan, sensor frame, m. :class:`radarsdf.io.Scans` supply poses, intensities and
-        Doppler unless these are passed separately.
+        Doppler unless these are passed separately, and the deviations that the sensor states.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan; of `Scans` with mountings, T_world_body. Required unless `points` are
         `Scans` with poses.
@@ -110,12 +111,13 @@ def fit(
 
     def read() -> FitInput:
         others = {"poses": poses, "intensities": intensities, "doppler_mps": doppler_mps}
-        rig, scans, poses_, intensities_, doppler_mps_ = filled(points, **others)
+        rig, scans, poses_, intensities_, doppler_mps_, sigmas = filled(points, **others, sigmas=None)
         if rig is not None:
             poses_ = rig.sensor_poses(pose_matrices(poses_, len(rig.of_scan)))
         given = scans, poses_, intensities_, doppler_mps_, rig
         num_threads = resolve_num_threads(config.num_threads)
-        rays, moving, why_none = static_rays(*given, config, origin=origin, num_threads=num_threads)
+        rays, moving, why_none = static_rays(*given, config, sigmas, origin=origin, num_threads=num_threads)
+        rays = without_false_deviations(rays, config.leaf_size_m, config.returns, num_threads)
         rays, radars = Radars.unify(rays, rig, config, num_threads)
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
@@ -221,7 +223,10 @@ class _Fit:
         saved = None if path is None else Checkpoint(path, given.rays, given.scale, config)
         self._lap("prepare_s")
 
-        noise = None if given.radars is None else given.radars.noise
+        noise: SensorNoise | None = None if given.radars is None else given.radars.noise
+        if noise is None and given.rays.stated is not None:  # the weights of the returns need it
+            surfels = Surfels.of(given.rays, config.leaf_size_m, num_threads)
+            noise = sensor_noise(surfels, given.rays, config.returns, num_threads)
         surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums, noise)
         learnt = given.rays if given.inside is None else given.rays.select(given.inside)
         self._lap("ghosts_s")

@@ -205,6 +205,7 @@ def static_rays(
     doppler_mps: Sequence[ArrayLike] | None,
     rig: Rig | None,
     config: FitConfig,
+    sigmas: Sequence[ArrayLike] | None = None,
     **options: Any,
 ) -> tuple[Rays, int, str | None]:
     """Prepare rays for a fit without :func:`moving_returns`; keep all without Doppler or ``config.returns.drop_moving``.
@@ -223,8 +224,9 @@ def static_rays(
         def static(arrays: Sequence[ArrayLike]) -> list[Array]:
             return [np.asarray(array)[~mask] for array, mask in zip(arrays, masks, strict=True)]
 
-        points, intensities = static(points), None if intensities is None else static(intensities)
-    rays = prepare(points, poses, intensities, rig=rig, **config.preparation | options)
+        points = static(points)
+        intensities, sigmas = (None if each is None else static(each) for each in (intensities, sigmas))
+    rays = prepare(points, poses, intensities, rig=rig, sigmas=sigmas, **config.preparation | options)
     return rays, moving, why_none
 
 

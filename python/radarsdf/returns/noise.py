@@ -1,5 +1,6 @@
 """Noise of the sensor, estimated from its returns, and noise reduction by moving returns onto planes."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -13,6 +14,7 @@ from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import WEIGHT_UNIT
 
+_LOG = logging.getLogger("radarsdf.returns")
 _Ranges = TypeVar("_Ranges", Floats32, Floats)
 
 NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
@@ -75,9 +77,9 @@ class SensorNoise:
         """Return the rows of the rays of each radar, with its noise."""
         return [(slice(None), self)]
 
-    def weights(self, rays: Rays) -> Ints32 | None:  # noqa: ARG002 - of one radar
+    def weights(self, rays: Rays) -> Ints32 | None:
         """Return the weight (N,) of each return in parts of 1 / `WEIGHT_UNIT`, relative to the mean of all. None: all equal."""
-        return None
+        return None if rays.stated is None else _in_parts(_stated_weights(self, rays))
 
     def of_scans(self, rays: Rays) -> Floats:
         """Return :attr:`variances` (F, 3) of the returns of each scan."""
@@ -103,17 +105,35 @@ class RigNoise(SensorNoise):
         weights = np.array([np.sum(mean.variances_m2(r) / own.variances_m2(r)) for own, r in of_each])
         weights *= counts.sum() / weights.sum() / np.maximum(counts, 1)
         weights[counts == 0] = 1.0  # a radar of a live map that has not measured yet
-        parts = np.maximum(np.rint(WEIGHT_UNIT * weights), 1).astype(int).tolist()
-        return cls(mean.range_m, mean.azimuth_rad, mean.elevation_rad, tuple(of_sensors), tuple(parts))
+        parts = tuple(_in_parts(weights).tolist())
+        return cls(mean.range_m, mean.azimuth_rad, mean.elevation_rad, tuple(of_sensors), parts)
 
     def by_radar(self, rays: Rays) -> list[tuple[slice | Ints, SensorNoise]]:
         return [*zip(rays.rows_of_sensors(), self.of_sensors, strict=True)]
 
     def weights(self, rays: Rays) -> Ints32 | None:
-        return np.array(self.parts, np.int32)[rays.sensor_of_scan][rays.scans]
+        parts = np.array(self.parts, np.int32)[rays.sensor_of_scan][rays.scans]
+        return parts if rays.stated is None else _in_parts(parts / WEIGHT_UNIT * _stated_weights(self, rays))
 
     def of_scans(self, rays: Rays) -> Floats:
         return np.array([own.variances for own in self.of_sensors])[rays.sensor_of_scan]
+
+
+def _in_parts(weights: Floats) -> Ints32:
+    return np.maximum(np.rint(WEIGHT_UNIT * weights), 1).astype(np.int32)
+
+
+def _stated_weights(noise: SensorNoise, rays: Rays) -> Floats:
+    """Return the weight (N,) of each return by its stated deviations, relative to the mean of those of its radar."""
+    assert rays.stated is not None
+    weights = np.empty(len(rays))
+    for rows, own in noise.by_radar(rays):
+        ranges2, factors = np.square(rays.ranges_m[rows], dtype=np.float64), np.square(rays.stated[rows]).T
+        along, azimuth, elevation = own.variances
+        usual = along + ranges2 * (azimuth + elevation)
+        of_rows = usual / (along * factors[0] + ranges2 * (azimuth * factors[1] + elevation * factors[2]))
+        weights[rows] = of_rows / of_rows.mean()
+    return weights
 
 
 def rig_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> RigNoise:
@@ -134,7 +154,8 @@ def sensor_noise(
 
     The variance across a plane is the sum of the three variances, each weighted by the squared component of the
     plane's normal along its axis. Across the beam, the deviation is an angle times the range. The three variances
-    are fitted to the squared distances by weighted least squares. Those set in `config` are kept fixed.
+    are fitted to the squared distances by weighted least squares. Those set in `config` are kept fixed. Where the sensor states
+    a deviation for each return, they are those of a return with the median one: makers differ from them by up to 100 times.
 
     A surfel of leaf cells of 0.2 m is 1.2 m wide, so noise above about 0.4 m is underestimated. Surface roughness
     counts as noise. Measured on simulated scenes: 0.7 to 1.2 times the true deviation.
@@ -143,16 +164,10 @@ def sensor_noise(
     free = np.isnan(known)
     guess = [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD]
     sigma2 = np.where(free, guess if initial is None else initial.deviations, known) ** 2
-    on_flat = surfels.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
-    tried = min(len(rays), int(_RETURNS * len(rays) / max(on_flat, 1.0)))
-    rows = np.linspace(0, len(rays) - 1, tried).astype(np.int64)
-    plane = surfels.flat_planes_at(rays.points.take(rows, axis=0), num_threads)
-    rows, plane = rows[plane >= 0], plane[plane >= 0]
-    if free.any() and len(rows) >= _MIN_RETURNS:
-        normals = surfels.normals.take(plane, axis=0)  # a third of the time of indexing
-        off_m = rays.points.take(rows, axis=0) - surfels.centres.take(plane, axis=0)
-        residual2 = np.einsum("ni,ni->n", off_m, normals) ** 2
-        shares = _shares(rays, rows, normals)
+    if not free.any():
+        return SensorNoise(*np.sqrt(sigma2).tolist())
+    residual2, shares = _residuals(surfels, rays, num_threads)
+    if len(residual2) >= _MIN_RETURNS:
         unexplained = residual2 - np.einsum("k,kn->n", sigma2[~free], shares[~free])
         least = np.array([0.025 * surfels.cell_size_m, 1e-3, 1e-3]) ** 2
         wanted = shares[free]
@@ -169,6 +184,40 @@ def sensor_noise(
     return SensorNoise(*np.sqrt(sigma2).tolist())
 
 
+def _residuals(surfels: Surfels, rays: Rays, num_threads: int) -> tuple[Floats, Floats]:
+    """Return the squared distances (M,) of a sample of the returns from flat surfels, m², and the factors (3, M) of :func:`_shares`."""
+    on_flat = surfels.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
+    tried = min(len(rays), int(_RETURNS * len(rays) / max(on_flat, 1.0)))
+    rows = np.linspace(0, len(rays) - 1, tried).astype(np.int64)
+    plane = surfels.flat_planes_at(rays.points.take(rows, axis=0), num_threads)
+    rows, plane = rows[plane >= 0], plane[plane >= 0]
+    normals = surfels.normals.take(plane, axis=0)  # a third of the time of indexing
+    off_m = rays.points.take(rows, axis=0) - surfels.centres.take(plane, axis=0)
+    return np.einsum("ni,ni->n", off_m, normals) ** 2, _shares(rays, rows, normals)
+
+
+def without_false_deviations(rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_threads: int) -> Rays:
+    """Leave out the stated deviations of radars whose returns have a more precise mean if all weigh the same."""
+    if rays.stated is None:
+        return rays
+    surfels, stated = Surfels.of(rays, leaf_size_m, num_threads), np.ones_like(rays.stated)
+    for rows in rays.rows_of_sensors():
+        own, means_m2 = rays.select(rows), []
+        variances = sensor_noise(surfels, own, config, num_threads).variances
+        for part in (own, replace(own, stated=None)):
+            residual2, shares = _residuals(surfels, part, num_threads)
+            weights = 1 / np.einsum("k,kn->n", variances, shares)
+            means_m2.append(np.sum(weights**2 * residual2) / max(np.sum(weights) ** 2, _LEAST_VARIANCE))
+        if means_m2[0] < means_m2[1]:
+            stated[rows] = own.stated
+    if (stated != 1).any():
+        return replace(rays, stated=stated)
+    _LOG.warning(
+        "Left out: deviations stated by the sensor. Returns of equal weight have a more precise mean."
+    )
+    return replace(rays, stated=None)
+
+
 def variances_across(rays: Rays, rows: Ints, normals: Floats, noise: SensorNoise) -> Floats:
     """Return the variances (M,) of the returns in `rows` (M,) across planes with `normals` (M, 3), m²."""
     return np.einsum("k,kn->n", np.array(noise.variances), _shares(rays, rows, normals))
@@ -183,7 +232,8 @@ def _shares(rays: Rays, rows: Ints, normals: Floats) -> Floats:
     azimuth /= np.maximum(np.sqrt(_dot(azimuth, azimuth)), _MIN_SINE)
     elevation = np.cross(along, azimuth, axis=0)
     shares = [np.square(_dot(axis, normal)) for axis in (along, azimuth, elevation)]
-    return np.stack([shares[0], shares[1] * ranges2, shares[2] * ranges2])
+    of_rows = np.stack([shares[0], shares[1] * ranges2, shares[2] * ranges2])
+    return of_rows if rays.stated is None else of_rows * np.square(rays.stated.take(rows, axis=0).T)
 
 
 # Vectors are columns (3, M): NumPy takes three times as long on rows of three.
@@ -209,10 +259,14 @@ def onto_surfels(
     surface, which is that of the returns minus their mean σ². This is the best linear estimate of its true
     distance (Wiener, 1949). Along the plane, the return keeps its position.
     """
-    of_rays = rays.points, rays.directions, rays.ranges_m, rays.scans, rays.up_of_scan
+    scans, up, variances = rays.scans, rays.up_of_scan, noise.of_scans(rays)
+    if rays.stated is not None:  # each return has its own
+        up, variances = up[scans], variances[scans] * np.square(rays.stated)
+        scans = np.arange(len(rays), dtype=np.int32)
+    of_rays = rays.points, rays.directions, rays.ranges_m, scans, up
     thickness = np.ascontiguousarray(surfels.variances[:, 0])
     planes = surfels.flat_planes_of(cells), surfels.centres, surfels.normals, thickness
-    moved_onto = move_onto_planes(*of_rays, *planes, noise.of_scans(rays), kept, num_threads)
+    moved_onto = move_onto_planes(*of_rays, *planes, variances, kept, num_threads)
     points, directions, ranges_m = moved_onto
     rest = rays if kept is None else rays.select(kept)
     return replace(rest, points=points, directions=directions, ranges_m=ranges_m)

@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,12 +16,13 @@ from radarsdf.returns.intensities import Plausible
 from radarsdf.rig import Rig
 
 _LOG = logging.getLogger("radarsdf.returns")
-_COLUMNS = ("points", "directions", "ranges_m", "intensities", "scans")
+_COLUMNS = ("points", "directions", "ranges_m", "intensities", "scans", "stated")
 _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repeat some
 
 # At equal received power the radar cross section grows with the fourth power of the range: a return at 100 times the median
 # range needs 80 dB more than the median one. Birds have about -30 dBsm, ships and buildings at most about 50 dBsm.
 _MOST_RATIO = 100.0
+_MOST_STATED = 8.0  # times the median, or the median times this: weights are multiples of 1 / 64
 _SAME_SQUARE = 1e-6  # relative difference of squares of ranges that are equal but for float32
 
 
@@ -45,6 +46,8 @@ class Rays:
     # (F,) row of the radar of each scan in its :class:`Rig`. None: there is one
     sensor_of_scan: Ints32 | None = None
     num_sensors: int = 1
+    # (N, 3) deviations of range, azimuth and elevation that the sensor states, divided by their medians. None: it states none
+    stated: Floats32 | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -71,6 +74,15 @@ class Rays:
         for own in self.rows_of_sensors():  # each radar has its own unit
             kept[own] = Plausible.of(kept[own], keys[own]).kept(kept[own])
         return replace(self, intensities=kept)
+
+    def with_stated(self, sigmas: Floats32) -> "Rays":
+        """Return rays with the deviations (N, 3) that the sensors state, m, rad, rad. Where one is not positive, it is the median."""
+        stated = np.where(sigmas > 0, sigmas, np.float32(np.nan))
+        for rows in self.rows_of_sensors():
+            known = [column[np.isfinite(column)] for column in stated[rows].T]
+            stated[rows] /= [np.median(column) if len(column) else 1.0 for column in known]
+        stated = np.where(np.isfinite(stated), stated, np.float32(1))
+        return replace(self, stated=stated.clip(1 / _MOST_STATED, _MOST_STATED))
 
     def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> "Rays":
         """Select rays by a slice of step 1, a mask (N,) or row indices (M,), in this order."""
@@ -173,6 +185,13 @@ def check_scans(
     return scans, [np.where(np.isfinite(v), v, np.float32(np.nan)) for v in values], left_out
 
 
+def _checked_sigmas(sigmas: Iterable[ArrayLike], scans: Sequence[Array]) -> Floats32:
+    each = [checks.real_array(own, "sigmas", np.float32) for own in sigmas]
+    fits = [own.shape for own in each] == [(len(scan), 3) for scan in scans]
+    checks.check(fits, "sigmas must have shape (N_i, 3) for each scan: range, azimuth and elevation")
+    return np.concatenate(each)
+
+
 def _lengths(vectors: Floats) -> Floats:
     """Return the lengths (N,) of vectors (N, 3), bit-identical to np.linalg.norm in a fifth of the time."""
     x, y, z = vectors.T
@@ -203,12 +222,13 @@ def prepare(
     lattice: WorldLattice | None = None,
     whole: bool = True,
     rig: Rig | None = None,
+    sigmas: Iterable[ArrayLike] | None = None,
     num_threads: int = 1,
 ) -> Rays:
     """Check scans and convert them to rays in the local frame.
 
     `points`, `intensities`: F arrays (N_i, 3), sensor frame, m, and (N_i,), sensor units; `poses` (F, 4, 4) T_world_sensor, m.
-    `rig`: the radars of the scans, if there are several.
+    `rig`: the radars of the scans, if there are several. `sigmas` (N_i, 3): deviations that the sensor states, m, rad, rad.
     The default `origin` is the mean sensor position, rounded to the nearest block corner of the `lattice`, so that maps of
     different scans share their cells. `whole` False: the scans are a part of a set, which need not have returns within the
     ranges, and intensity outliers are not replaced by NaN.
@@ -245,6 +265,8 @@ def prepare(
     of_rig = () if rig is None else (rig.of_scan, len(rig.labels))
     rays = Rays(*columns, T_world_sensor[:, :3, 2].copy(), left_out.given, *of_rig)
     rays = rays.without_outliers() if whole else rays
+    if sigmas is not None:
+        rays = rays.with_stated(_checked_sigmas(sigmas, scans)[kept])
     if rays.intensities is not None and whole:
         fits = rays.with_intensity.any()
         checks.check(fits, "no intensity is finite: omit intensities if the sensor does not measure them")
