@@ -80,9 +80,8 @@ def _add_fit(results: Results, radar_map: radarsdf.RadarMap) -> None:
     loss = "".join(f", {stage} loss {value:.3g}" for stage, value in losses.items())
     results.add(f"fit {seconds:.1f} s: {radar_map}{loss}", seconds=seconds, losses=losses)
     angles = ", ".join(f"{axis} {noise[f'{axis}_rad']:.4f} rad" for axis in ("azimuth", "elevation"))
-    results.add(
-        f"noise: range {noise['range_m']:.3f} m, {angles}", noise=noise, map_bytes=radar_map.file_bytes
-    )
+    described = f"noise: range {noise['range_m']:.3f} m, {angles}"
+    results.add(described, noise=noise, map_bytes=radar_map.file_bytes)
 
 
 def demo(given: Namespace, results: Results) -> None:

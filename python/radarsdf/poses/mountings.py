@@ -1,7 +1,5 @@
 """Joint estimate of the path of a body and the mountings of its radars by the Gauss-Newton method."""
 
-from typing import Any
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -31,11 +29,6 @@ _LEAST_CHANGE = 1e-3  # m/s and rad/s, between knots
 _LOOSE = 5.0
 
 
-def _variances(J: Any, covariance: Floats) -> Floats:
-    """Return the diagonal (N,) of J C Jᵀ for a sparse J (N, U) and covariance C (U, U)."""
-    return np.asarray(J.multiply(J @ covariance).sum(axis=1)).ravel()
-
-
 def estimate_mountings(
     path: BodyPath, radars: equations.RadarsOfBody, steps: tuple[Motion, Floats] | None, config: FitConfig
 ) -> tuple[BodyPath, Floats]:
@@ -57,18 +50,19 @@ def estimate_mountings(
         robust = 1 / (1 + (off_mps**2).sum(axis=1) / (3 * _SIGMAS2))
         whitening = equations.block_diagonal(robust[:, None, None] * radars.whitening)
         changes, smooth = equations.smooth_rows(path)
-        weights = sparse.diags(np.tile(1 / (_LOOSE * spread), len(smooth)))
-        rows = [
-            (whitening @ of_velocities, robust[:, None] * off_mps),
-            (weights @ changes, smooth / (_LOOSE * spread)),
-        ]
+        loose = _LOOSE * spread
+        weights = sparse.diags(np.tile(1 / loose, len(smooth)))
+        rows = [(whitening @ of_velocities, robust[:, None] * off_mps), (weights @ changes, smooth / loose)]
         for J, residual in rows if steps is None else [*rows, equations.step_rows(path, *steps)]:
             H, g = H + J.T @ J, g + J.T @ residual.ravel()
         if cells:
             of_planes, gradient = equations.plane_equations(poses, radars, cells * radars.cell_m, config)
             H, g = H + of_poses.T @ of_planes @ of_poses, g + of_poses.T @ gradient
             covariance = splu(H[:num_path, :num_path].tocsc()).solve(np.eye(num_path))
-            of_errors = _variances(changes[:, :num_path], covariance).reshape(-1, 6)
+            J = changes[:, :num_path]
+            of_errors = np.asarray(J.multiply(J @ covariance).sum(axis=1)).reshape(
+                -1, 6
+            )  # the diagonal of J C Jᵀ
             spread = np.sqrt((smooth**2 + of_errors).mean(axis=0)) + _LEAST_CHANGE
         path = path.moved(-splu(H.tocsc()).solve(g))
     of_radars = np.eye(len(held), K * OF_RADAR, -num_path)
