@@ -53,7 +53,7 @@ void bind_local_planes(py::module_& m) {
                           num_threads);
             return scores;
           },
-          "points"_array, "poses"_array, "variances"_a, "num_threads"_a = 0,
+          "points"_array, "poses"_array, "variances"_a, "num_threads"_a = 1,
           "Scores 1 / (1 + r² / 4), (K, N) float64, for poses (K, 4, 4) and points (N, 3), sensor frame, m, with the "
           "residual r from a plane in standard deviations; 0 for points without a plane.");
 }
