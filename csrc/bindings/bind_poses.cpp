@@ -44,16 +44,16 @@ void bind_local_planes(py::module_& m) {
       .def(
           "scores",
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& poses,
-             const VarianceNumbers& variances) {
+             const VarianceNumbers& variances, int num_threads) {
             const std::int64_t count = check_points(points);
             const std::int64_t num_poses = poses.ndim() == 3 ? poses.shape(0) : 0;
             check_shape(poses, {num_poses, 4, 4}, "poses");
             Array<double> scores = new_array<double>(num_poses, count);
-            planes.scores(points.data(), count, poses.data(), num_poses, variances_of(variances),
-                          scores.mutable_data());
+            planes.scores(points.data(), count, poses.data(), num_poses, variances_of(variances), scores.mutable_data(),
+                          num_threads);
             return scores;
           },
-          "points"_array, "poses"_array, "variances"_a,
+          "points"_array, "poses"_array, "variances"_a, "num_threads"_a = 1,
           "Scores 1 / (1 + r² / 4), (K, N) float64, for poses (K, 4, 4) and points (N, 3), sensor frame, m, with the "
           "residual r from a plane in standard deviations; 0 for points without a plane.");
 }

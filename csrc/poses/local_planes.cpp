@@ -5,6 +5,7 @@
 #include <stdexcept>
 
 #include "returns/principal_axes.hpp"
+#include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
@@ -102,8 +103,8 @@ void LocalPlanes::add(const double* points, std::int64_t count, int sign) {
       cells_.erase(cell);
     }
   }
-  known_ = FlatMap(planes_.size());  // not cleared: after a search, that of a scan would touch megabytes
-  planes_.clear();
+  // Not cleared: after a search, those of a scan would touch megabytes.
+  for (Known& known : known_) known = {FlatMap(known.planes.size()), {}};
 }
 
 std::optional<LocalPlanes::Plane> LocalPlanes::plane_of(std::uint64_t key) const {
@@ -159,18 +160,18 @@ std::optional<LocalPlanes::Plane> LocalPlanes::plane_of(std::uint64_t key) const
 }
 
 std::optional<LocalPlanes::Residual> LocalPlanes::residual(const Beam& beam, const double* pose,
-                                                           const ReturnVariances& noise) const {
+                                                           const ReturnVariances& noise, Known& known) const {
   const Vec3 point = rotate(pose, beam.point) + translation(pose);
   const auto cell = key(point);
-  std::int32_t row = cell ? known_.find(*cell) : kNoPlane;
+  std::int32_t row = cell ? known.rows.find(*cell) : kNoPlane;
   if (row == kUnknown) {
     const std::optional<Plane> plane = plane_of(*cell);
-    row = plane ? static_cast<std::int32_t>(planes_.size()) : kNoPlane;
-    known_.insert(*cell, row);
-    if (plane) planes_.push_back(*plane);
+    row = plane ? static_cast<std::int32_t>(known.planes.size()) : kNoPlane;
+    known.rows.insert(*cell, row);
+    if (plane) known.planes.push_back(*plane);
   }
   if (row == kNoPlane) return std::nullopt;
-  const Plane& here = planes_[static_cast<std::size_t>(row)];
+  const Plane& here = known.planes[static_cast<std::size_t>(row)];
   const Vec3 off = point - here.centre;
   const double first = dot(off, here.axes[1]), second = dot(off, here.axes[2]);
   const double of_plane = here.variance + first * first + second * second;
@@ -186,7 +187,7 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
   squares.reserve(count);
   for (std::int64_t i = 0; i < count; ++i) {
     const Beam beam(vec3(points, i), {0, 0, 1});
-    const auto found = residual(beam, pose, noise);
+    const auto found = residual(beam, pose, noise, known_.front());
     if (!found) continue;
     rows.push_back({*found, rotate(pose, beam.point)});
     squares.push_back(found->value * found->value / found->variance);
@@ -198,7 +199,7 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
     const double variance = scale * residual.variance, share = robust_share(residual.value, variance);
     const double weight = share * share, information = weight / variance;
     found.weight += weight;
-    const Plane& of = planes_[static_cast<std::size_t>(residual.plane)];
+    const Plane& of = known_.front().planes[static_cast<std::size_t>(residual.plane)];
     double normal[kPose], tilts[2][kPose];  // Jacobians
     for (int k = 0; k < 3; ++k) {
       store(of.axes[k], k == 0 ? normal : tilts[k - 1]);
@@ -222,15 +223,20 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
 }
 
 void LocalPlanes::scores(const double* points, std::int64_t count, const double* poses, std::int64_t num_poses,
-                         const ReturnVariances& noise, double* scores) const {
-  // Return by return, whose cells at all poses stay in the cache.
-  for (std::int64_t i = 0; i < count; ++i) {
-    const Beam beam(vec3(points, i), {0, 0, 1});
-    for (std::int64_t k = 0; k < num_poses; ++k) {
-      const auto found = residual(beam, poses + 16 * k, noise);
-      scores[count * k + i] = found ? robust_share(found->value, found->variance) : 0.0;
+                         const ReturnVariances& noise, double* scores, int num_threads) const {
+  const auto parts = std::clamp<std::int64_t>(count, 1, resolve_num_threads(num_threads));
+  known_.resize(std::max(known_.size(), static_cast<std::size_t>(parts)));
+  parallel_tasks(parts, num_threads, [&](std::int64_t part) {
+    Known& known = known_[static_cast<std::size_t>(part)];
+    // Return by return, whose cells at all poses stay in the cache.
+    for (std::int64_t i = count * part / parts; i < count * (part + 1) / parts; ++i) {
+      const Beam beam(vec3(points, i), {0, 0, 1});
+      for (std::int64_t k = 0; k < num_poses; ++k) {
+        const auto found = residual(beam, poses + 16 * k, noise, known);
+        scores[count * k + i] = found ? robust_share(found->value, found->variance) : 0.0;
+      }
     }
-  }
+  });
 }
 
 }  // namespace radarsdf

@@ -41,7 +41,7 @@ class LocalPlanes {
   // scores: (num_poses, count), 1 / (1 + r^2 / (4 variance)) for each pose (num_poses, 4, 4) and return; 0 for a return
   // without a plane.
   void scores(const double* points, std::int64_t count, const double* poses, std::int64_t num_poses,
-              const ReturnVariances& noise, double* scores) const;
+              const ReturnVariances& noise, double* scores, int num_threads) const;
 
  private:
   static constexpr int kMoments = 10;  // 1, x, y, z, xx, xy, xz, yy, yz, zz, in quanta from the corner of the cell
@@ -50,6 +50,10 @@ class LocalPlanes {
     Vec3 centre, axes[3];  // the normal, and in the plane, each as long as the standard deviation of its slope
     double variance;       // at the centre, m^2
   };
+  struct Known {
+    FlatMap rows;  // of `planes`
+    std::vector<Plane> planes;
+  };
   struct Residual {
     double value, variance;
     std::int32_t plane;
@@ -57,14 +61,13 @@ class LocalPlanes {
 
   std::optional<std::uint64_t> key(const Vec3& point) const;
   std::optional<Plane> plane_of(std::uint64_t key) const;  // if it is flat
-  std::optional<Residual> residual(const Beam& beam, const double* pose, const ReturnVariances& noise) const;
+  std::optional<Residual> residual(const Beam& beam, const double* pose, const ReturnVariances&, Known&) const;
 
   double cell_size_m_, cells_per_m_;
   FlatMap cells_;  // rows of sums_
   std::vector<Moments> sums_;
-  std::vector<std::int32_t> free_;  // rows of sums_ without a cell
-  mutable FlatMap known_;           // rows of planes_, a cache that is cleared when scans change
-  mutable std::vector<Plane> planes_;
+  std::vector<std::int32_t> free_;       // rows of sums_ without a cell
+  mutable std::vector<Known> known_{1};  // of each thread, caches that are cleared when scans change
 };
 
 }  // namespace radarsdf

@@ -669,6 +669,7 @@ class LocalPlanes:
         variances: typing.Annotated[
             collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
         ],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> numpy.typing.NDArray[numpy.float64]:
         """
         Scores 1 / (1 + r² / 4), (K, N) float64, for poses (K, 4, 4) and points (N, 3), sensor frame, m, with the residual r from a plane in standard deviations; 0 for points without a plane.

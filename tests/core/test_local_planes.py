@@ -73,6 +73,14 @@ def test_steps_by_gradient_and_hessian_lead_to_the_pose():
     assert np.linalg.eigvalsh(hessian - doubt).min() > 0
 
 
+def test_scores_do_not_depend_on_threads():
+    poses = np.stack([pose(x, 0, 0, 0, 0, 0.1 * x) for x in np.linspace(-1, 1, 20)])
+    scores = [planes_of(room(0)).scores(room(1), poses, VARIANCES, threads) for threads in (1, 2, 5)]
+    assert scores[0].mean() > 0.1
+    for found in scores[1:]:
+        np.testing.assert_array_equal(found, scores[0])
+
+
 def test_along_a_wall_the_position_is_unobservable():
     rng = np.random.default_rng(0)
 

@@ -22,6 +22,7 @@ from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.rig import Imu
 from radarsdf.scans import Scans
+from radarsdf.threads import resolve_num_threads
 
 # Cells of planes for the last estimate: larger ones bend poles and corners, 4 to 17 cm, not 1 to 6.
 _FINE_CELLS = 0.5
@@ -275,12 +276,12 @@ class _Localiser:
         """Build the anchor of scans (N_i, 3) at about these poses (K, 4, 4), with ranges up to `reach_m`."""
         planes = self.index.near(poses[:, :3, 3], reach_m, _FINE_CELLS)
         planes.variances = noise.variances
-        facing, cells = [], []
+        facing, cells, workers = [], [], resolve_num_threads(self.config.num_threads)
         for scan, pose in zip(scans, poses, strict=True):
             rays = np.einsum("ij,nj->ni", pose[:3, :3], scan)
             # Thin walls and trunks have two sides, of which the map may show the other one.
-            normals = self.index.surface.normals[self.index.tree.query(rays + pose[:3, 3])[1]]
-            seen = np.einsum("ni,ni->n", rays, normals) < 0
+            _, nearest = self.index.tree.query(rays + pose[:3, 3], workers=workers)
+            seen = np.einsum("ni,ni->n", rays, self.index.surface.normals[nearest]) < 0
             facing.append(np.ascontiguousarray(scan[seen]))
             cells.append(np.floor((rays[seen] + pose[:3, 3]) / (3 * self.index.cell_m)))
         number = sum(map(len, facing))

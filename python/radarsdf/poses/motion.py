@@ -123,13 +123,13 @@ class PredictedStep:
         return transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s, self.lever))
 
     def covariance(self, turn: Floats | None = None) -> Floats:
-        """Return the covariance (6, 6) of translation and rotation vector, in the first frame, correlated by the turn."""
+        """Return covariances (..., 6, 6) of translation and rotation vector, in the first frame, correlated by turns (..., 3)."""
         turn = self.turn.mean if turn is None else turn
         # Derivative of the translation by the turn: about that of its second half.
-        swept = self.lever - skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
-        both = np.concatenate([swept, np.eye(3)])
-        covariance = both @ self.turn.covariance @ both.T
-        covariance[:3, :3] += self.translation_covariance
+        swept = self.lever - skew(self.duration_s / 2 * rotation(turn) @ self.end_mps)
+        both = np.concatenate([swept, np.broadcast_to(np.eye(3), swept.shape)], axis=-2)
+        covariance = both @ self.turn.covariance @ both.swapaxes(-1, -2)
+        covariance[..., :3, :3] += self.translation_covariance
         return covariance
 
     def spread_m(self, radius_m: float) -> float:

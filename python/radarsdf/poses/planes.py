@@ -269,11 +269,13 @@ class PlaneMap:
         *equations, inliers = self.fine.agreement(scan, pose, self.variances)
         return *_discount_tilts(*equations), inliers
 
-    def fit(self, scan: Floats, mean: Floats, prior: Floats, start: Floats | None = None) -> Tracked:
+    def fit(
+        self, scan: Floats, mean: Floats, prior: Floats, start: Floats | None = None, *, finely: bool = True
+    ) -> Tracked:
         """Fit the pose of a scan (N, 3), sensor frame, m, coarse to fine, given that of the prior and its covariance (6, 6)."""
         information = np.linalg.inv(prior + _LEAST_VARIANCE * np.eye(6))
         pose = mean if start is None else start
-        for planes, settled in zip((self.coarse, self.fine), _SETTLED, strict=True):
+        for planes, settled in [(self.coarse, _SETTLED[0]), (self.fine, _SETTLED[1])][: 1 + finely]:
             for _ in range(_ITERATIONS):
                 *equations, inliers = planes.agreement(scan, pose, self.variances)
                 hessian, gradient = _discount_tilts(*equations)

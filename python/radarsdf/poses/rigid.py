@@ -75,10 +75,10 @@ def covariance_in(covariance: Floats, R: Floats) -> Floats:
 
 
 def skew(vectors: Floats) -> Floats:
-    """Return the cross-product matrices (N, 3, 3) of `vectors` (N, 3)."""
-    x, y, z = vectors.T
-    o = np.zeros(len(vectors))
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], 1).reshape(-1, 3, 3)
+    """Return the cross-product matrices (..., 3, 3) of `vectors` (..., 3)."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*vectors.shape, 3)
 
 
 def rotation(vector: Floats) -> Floats:

@@ -36,7 +36,8 @@ _NOISE_RETURNS = 10_000  # of the last scans, for this estimate
 
 # Search, where the prediction is less certain than Gauss-Newton requires. Acceptance by a gain over chance alone, or over rivals alone,
 # split three of five recorded drives into more segments.
-_SCORED_RETURNS = 250  # of a scan
+_FEW, _SCORED, _FITTED = 64, 250, 500  # returns: to score all, to score the likely, to register the best
+_LIKELY = 1024  # candidates
 _BEST = 12  # candidates to register
 _UNRELATED = 500  # poses, for the agreement by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at an accepted pose
@@ -66,7 +67,7 @@ class Tracker:
         capture_m = self._planes.capture_m
         if predicted.spread_m(radius_m) <= capture_m:
             prior = self._prior(predicted, predicted.turn.mean)
-            return self._place(scan, prior, self._planes.fit(scan, *prior), predicted.turn.mean)
+            return self._place(scan, prior[1], self._planes.fit(scan, *prior), predicted.turn.mean)
         spread_m = predicted.spread_m(0.0)
         if spread_m <= _MOST_RADII * radius_m:
             if (found := self._search_pose(scan, predicted, radius_m)) is not None:
@@ -107,38 +108,42 @@ class Tracker:
         return Tracked(pose, covariance, 0.0, self.last.segment, turn)
 
     def _prior(self, predicted: PredictedStep, turn: Floats) -> tuple[Floats, Floats]:
-        """Return the mean pose of a sensor that turned by `turn`, and its covariance (6, 6)."""
+        """Return mean poses (..., 4, 4) of a sensor that turned by `turn` (..., 3), and their covariances (..., 6, 6)."""
         last = self.last.pose
         return last @ predicted.pose(turn), covariance_in(predicted.covariance(turn), last[:3, :3])
 
-    def _place(self, scan: Floats, prior: tuple[Floats, Floats], found: Tracked, turn: Floats) -> Tracked:
-        found = self._planes.discount_chance(scan, prior[1], found)
+    def _place(self, scan: Floats, prior: Floats, found: Tracked, turn: Floats) -> Tracked:
+        found = self._planes.discount_chance(scan, prior, found)
         turn = rotation_vector(self.last.pose[:3, :3].T @ found.pose[:3, :3], turn)
         return replace(found, segment=self.last.segment, turn=turn)
 
     def _search_pose(self, scan: Floats, predicted: PredictedStep, radius_m: float) -> Tracked | None:
         """Search many poses for the best, if the returns agree there significantly better than elsewhere and than by chance."""
-        sample, capture_m = thin(scan, _SCORED_RETURNS), self._planes.capture_m
+        planes, capture_m = self._planes, self._planes.capture_m
+        few, sample, more = (thin(scan, most) for most in (_FEW, _SCORED, _FITTED))
 
-        def score(poses: Floats) -> Floats:
-            return self._planes.coarse.scores(sample, np.ascontiguousarray(poses), self._planes.variances)
+        def score(points: Floats, poses: Floats) -> Floats:
+            return planes.coarse.scores(points, poses, planes.variances, self.config.num_threads)
 
         turns, steps = predicted.candidates(capture_m, radius_m)
-        poses = np.einsum("ij,kjl->kil", self.last.pose, steps)
-        means = score(poses).mean(axis=1)
-        rows = _best(means)
+        poses = np.ascontiguousarray(np.einsum("ij,kjl->kil", self.last.pose, steps))
+        likely = _best(score(few, poses).mean(axis=1), _LIKELY)
+        turns, poses = turns[likely], poses[likely]
+        agreeing = score(sample, poses).mean(axis=1)
+        rows = _best(agreeing)
         # In a self-similar scene, the best candidates may all lie near a wrong place.
         elsewhere = np.flatnonzero(apart_m(poses, poses[rows[0]], radius_m) > 2 * capture_m)
-        rows = np.concatenate([rows, elsewhere[_best(means[elsewhere])]])
-        priors = [self._prior(predicted, turns[i]) for i in rows]
-        found = [self._planes.fit(scan, *priors[k], poses[i]) for k, i in enumerate(rows)]
-        at = np.stack([one.pose for one in found])
-        scores, by_chance = score(at), score(self._draw_unrelated(radius_m))
+        rows = np.concatenate([rows, elsewhere[_best(agreeing[elsewhere])]])
+        means, covariances = self._prior(predicted, turns[rows])
+        starts = zip(means, covariances, poses[rows], strict=True)
+        at = np.stack([planes.fit(more, *start, finely=False).pose for start in starts])
+        scores, by_chance = score(sample, at), score(sample, self._draw_unrelated(radius_m))
         first = int(np.argmax(scores.mean(axis=1)))
         rivals = scores[apart_m(at, at[first], radius_m) > capture_m]
         gains = scores[first] - np.concatenate([by_chance[_best(by_chance.mean(axis=1))], rivals])
         clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(sample))
-        return self._place(scan, priors[first], found[first], turns[rows[first]]) if clear.all() else None
+        found = planes.fit(scan, means[first], covariances[first], at[first])
+        return self._place(scan, covariances[first], found, turns[rows[first]]) if clear.all() else None
 
     def _draw_unrelated(self, reach_m: float) -> Floats:
         """Draw upright poses (_UNRELATED, 4, 4) near those of the last scans, with other headings."""
@@ -153,8 +158,8 @@ class Tracker:
         return poses
 
 
-def _best(scores: Floats) -> NDArray[np.intp]:
-    return np.argsort(-scores, kind="stable")[:_BEST]
+def _best(scores: Floats, count: int = _BEST) -> NDArray[np.intp]:
+    return np.argsort(-scores, kind="stable")[:count]
 
 
 _PASSES = 3
