@@ -275,7 +275,7 @@ class PlaneMap:
         """Fit the pose of a scan (N, 3), sensor frame, m, coarse to fine, given that of the prior and its covariance (6, 6)."""
         information = np.linalg.inv(prior + _LEAST_VARIANCE * np.eye(6))
         pose = mean if start is None else start
-        for planes, settled in [(self.coarse, _SETTLED[0]), (self.fine, _SETTLED[1])][: 1 + finely]:
+        for planes, settled in [*zip((self.coarse, self.fine), _SETTLED, strict=True)][: 1 + finely]:
             for _ in range(_ITERATIONS):
                 *equations, inliers = planes.agreement(scan, pose, self.variances)
                 hessian, gradient = _discount_tilts(*equations)
