@@ -59,10 +59,8 @@ def estimate_mountings(
             of_planes, gradient = equations.plane_equations(poses, radars, cells * radars.cell_m, config)
             H, g = H + of_poses.T @ of_planes @ of_poses, g + of_poses.T @ gradient
             covariance = splu(H[:num_path, :num_path].tocsc()).solve(np.eye(num_path))
-            J = changes[:, :num_path]
-            of_errors = np.asarray(J.multiply(J @ covariance).sum(axis=1)).reshape(
-                -1, 6
-            )  # the diagonal of J C Jᵀ
+            J = changes[:, :num_path]  # the diagonal of J C Jᵀ:
+            of_errors = np.asarray(J.multiply(J @ covariance).sum(axis=1)).reshape(-1, 6)
             spread = np.sqrt((smooth**2 + of_errors).mean(axis=0)) + _LEAST_CHANGE
         path = path.moved(-splu(H.tocsc()).solve(g))
     of_radars = np.eye(len(held), K * OF_RADAR, -num_path)
