@@ -213,6 +213,13 @@ def test_the_second_arc_of_a_recorded_roundabout():
     assert np.median(off_deg) < 2
 
 
+def test_motion_that_returns_do_not_observe_is_refused_with_a_guess():
+    along = radarsdf.simulate.wall(frames=24)
+    radar_map = radarsdf.fit(along.points, along.poses, config=FitConfig.quick(), progress=False)
+    with pytest.raises(ValueError, match="do not observe how the sensor moved"):
+        radarsdf.locate(radar_map, along.points, times_s=0.1 * np.arange(24), guess=along.poses[0])
+
+
 def test_a_live_map_of_another_session_finds_the_radar(first, day, tmp_path):
     live = radarsdf.LiveMap()
     for scan in measured(first):

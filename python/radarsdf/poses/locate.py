@@ -12,7 +12,7 @@ from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.map import Map
 from radarsdf.poses.checked_scans import checked_settings
-from radarsdf.poses.odometry import track_scans
+from radarsdf.poses.odometry import check_observed, track_scans
 from radarsdf.poses.planes import PlaneMap, SensorReturns, Tracked, least_certain, plane_cell_m, thin
 from radarsdf.poses.refine import WEAK, JointEstimator
 from radarsdf.poses.rigid import covariance_in, increments, skew, transform
@@ -121,6 +121,7 @@ def locate(
     config = checked_settings(config)
     start = None if guess is None else check_pose(guess, "guess")
     drive, tracked, _, checked = track_scans(points, doppler_mps, times_s, imu, config, progress)
+    checked.notes.extend(check_observed(tracked, drive, checked.notes, turns=False))  # the map shows turns
     count = len(tracked)
     poses, covariance = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
     explained, segments = np.full(count, np.nan), np.full(count, -1)

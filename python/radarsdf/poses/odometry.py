@@ -119,7 +119,7 @@ def odometry(
     config = checked_settings(config)
     drive, tracked, compared, scans = track_scans(points, doppler_mps, times_s, imu, config, progress)
     velocities, inertial, notes = drive.velocities, drive.inertial, scans.notes
-    notes += _check_observed(tracked, drive, notes)
+    notes += check_observed(tracked, drive, notes)
     segments = np.array([found.segment for found in tracked])
     poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config)
     notes += loops
@@ -208,16 +208,16 @@ def _estimate_jointly(
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance, notes
 
 
-def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> list[str]:
-    """Return notes on assumptions. Raise an UnobservedMotionError if a part of the motion is not observable."""
-    if len(tracked) < 2:
+def check_observed(found: list[Tracked], drive: Drive, notes: list[str], *, turns: bool = True) -> list[str]:
+    """Return notes on assumptions. Raise an UnobservedMotionError if translations, or those and `turns`, are not observable."""
+    if len(found) < 2:
         return []
 
     def refuse(moved: str, why: str, missing: str) -> None:
         msg = f"the returns alone do not observe how the sensor {moved}: {why}. Give {missing}, or poses"
         raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
 
-    moved, turned = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
+    moved, turned = np.median([one.observed for one in found[1:]], axis=0).tolist()
     removed = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
     unsure = any(note.startswith(NOT_USED) for note in notes)
     doppler = "Doppler that most returns of a scan agree on" if unsure else "their Doppler (doppler_mps)"
@@ -228,13 +228,13 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
         refuse("moved", removed.format(moved, LEAST_OBSERVED), doppler)
     durations_s, velocities = np.diff(drive.times_s), drive.velocities
     measured = isinstance(velocities, BodyVelocities) and velocities.measure_turns(durations_s, least_turned)
-    unknown = not measured and drive.inertial.gyroscope is None and turned < least_turned
+    unknown = turns and not measured and drive.inertial.gyroscope is None and turned < least_turned
     if unknown and drive.usual_turn_rad_s >= SLOW_TURN_RAD_S:
         refuse("turned", removed.format(turned, least_turned), "a gyroscope (imu)")
     assumed = []
     if drive.velocities is None:
-        within = np.flatnonzero(np.diff([found.segment for found in tracked]) == 0)
-        motions = steps(np.stack([found.pose for found in tracked]))[within]
+        within = np.flatnonzero(np.diff([one.segment for one in found]) == 0)
+        motions = steps(np.stack([one.pose for one in found]))[within]
         if (significance := motion_significance(drive.scans, within, motions)) < -ERRORS:
             refuse("moved", "scans agree better without any motion", doppler)
         if significance < ERRORS:
