@@ -18,10 +18,10 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.core import CommonPlanes
 from radarsdf.poses.body_path import OF_RADAR, BodyPath
 from radarsdf.poses.motion import Motion
-from radarsdf.poses.planes import SensorReturns, errors_with, planes_of, unbiased_normals
+from radarsdf.poses.planes import SensorReturns, planes_of, unbiased_normals
 from radarsdf.poses.rigid import assembled, skew
 from radarsdf.returns.ghosts import first_crossed
-from radarsdf.returns.noise import rig_noise
+from radarsdf.returns.noise import errors_with, rig_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 
 _FEWEST = 3  # returns of a radar on a plane that it shares with others

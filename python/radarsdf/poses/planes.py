@@ -7,11 +7,11 @@ import numpy as np
 from scipy.linalg import eigh, lapack
 from scipy.spatial import cKDTree
 
-from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Bools, Floats, Floats32, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.core import CellBlocks, CommonPlanes, LocalPlanes
 from radarsdf.poses.rigid import increments, moved
-from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
+from radarsdf.returns.noise import SensorNoise, errors_with, rig_noise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import merged_keys
@@ -24,7 +24,6 @@ _DOUBLINGS = 4
 # Width of the factored band, scans. 16 to 128 take the same time, since fewer need more iterations.
 _TOGETHER = 32
 _LEAST_RANGE_M = 1e-6  # against division by zero
-_LEAST_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, against division by zero
 # Cells are at least a quarter of the spacing of returns in a scan: with 40 returns over 150 m, smaller cells have too few. Radars
 # of 500 to 2,000 returns a scan have a spacing of 0.2 to 0.5 m, so that their cells are those of a map.
 _CELLS_APART = 4
@@ -180,18 +179,6 @@ def common_planes(
     of_planes = np.concatenate(centres), np.ascontiguousarray(np.concatenate(normals))
     together = min(window, _TOGETHER), num_threads
     return CommonPlanes(*of_rays, *of_scans, *of_planes, cell_m, noise.of_scans(rays), *together), noise
-
-
-def errors_with(rays: Rays, rows: Ints, normals: Floats32 | Floats, noise: SensorNoise) -> Floats:
-    """Return the errors (K, 3) of returns `rows` (K,) to expect from an error of 1 along `normals` (K, 3)."""
-    directions, ranges_m = rays.directions[rows].astype(np.float64), rays.ranges_m[rows, None]
-    across = np.cross(rays.up_of_scan[rays.scans[rows]], directions)
-    across /= np.maximum(np.linalg.norm(across, axis=1), _LEAST_SINE)[:, None]
-    along, aside = (np.einsum("ni,ni->n", axes, normals)[:, None] * axes for axes in (directions, across))
-    variances = noise.of_scans(rays)[rays.scans[rows]].T[:, :, None]
-    angular = variances[1] * aside + variances[2] * (normals - along - aside)
-    errors = variances[0] * along + ranges_m**2 * angular
-    return np.asarray(errors / np.einsum("ni,ni->n", errors, normals)[:, None])
 
 
 def planes_of(rays: Rays, surfels: Surfels, num_threads: int, noise: SensorNoise | None = None) -> Ints32:

@@ -226,14 +226,27 @@ def variances_across(rays: Rays, rows: Ints, normals: Floats, noise: SensorNoise
 def _shares(rays: Rays, rows: Ints, normals: Floats) -> Floats:
     """Return the factors (3, M) of the three noise variances in the variance across planes."""
     ranges2 = np.square(rays.ranges_m.take(rows).astype(np.float64))
-    up, normal = rays.up_of_scan.take(rays.scans.take(rows), axis=0).T, normals.T
-    along = rays.directions.take(rows, axis=0).T.astype(np.float64)
-    azimuth = np.cross(up, along, axis=0)  # direction of increasing azimuth
-    azimuth /= np.maximum(np.sqrt(_dot(azimuth, azimuth)), _MIN_SINE)
-    elevation = np.cross(along, azimuth, axis=0)
-    shares = [np.square(_dot(axis, normal)) for axis in (along, azimuth, elevation)]
+    shares = [np.square(_dot(axis, normals.T)) for axis in _error_axes(rays, rows)]
     of_rows = np.stack([shares[0], shares[1] * ranges2, shares[2] * ranges2])
     return of_rows if rays.stated is None else of_rows * np.square(rays.stated.take(rows, axis=0).T)
+
+
+def errors_with(rays: Rays, rows: Ints, normals: Floats32 | Floats, noise: SensorNoise) -> Floats:
+    """Return the errors (M, 3) of the returns in `rows` (M,) to expect from an error of 1 along `normals` (M, 3)."""
+    variances, normal = noise.of_scans(rays)[rays.scans[rows]].T, normals.T.astype(np.float64)
+    variances[1:] *= np.square(rays.ranges_m[rows].astype(np.float64))
+    parts = zip(variances, _error_axes(rays, rows), strict=True)
+    errors = np.sum([variance * _dot(axis, normal) * axis for variance, axis in parts], axis=0)
+    return np.asarray(errors / _dot(errors, normal)).T
+
+
+def _error_axes(rays: Rays, rows: Ints) -> tuple[Floats, Floats, Floats]:
+    """Return the directions (3, M) of the three errors of returns: along the beam, and of increasing azimuth and elevation."""
+    up = rays.up_of_scan.take(rays.scans.take(rows), axis=0).T
+    along = rays.directions.take(rows, axis=0).T.astype(np.float64)
+    azimuth = np.cross(up, along, axis=0)
+    azimuth /= np.maximum(np.sqrt(_dot(azimuth, azimuth)), _MIN_SINE)
+    return along, azimuth, np.cross(along, azimuth, axis=0)
 
 
 # Vectors are columns (3, M): NumPy takes three times as long on rows of three.
