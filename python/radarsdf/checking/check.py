@@ -35,17 +35,10 @@ def check(
 
     Parameters
     ----------
-    points : sequence of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Other attributes of
-        :class:`radarsdf.io.Scans` are used unless passed here.
-    poses : array_like, optional
-        (F, 4, 4) T_world_sensor, m, one per scan. Optional only with `Scans`.
-    intensities : sequence of F arrays, optional
-        (N_i,) each, sensor units.
-    doppler_mps : sequence of F arrays, optional
-        (N_i,) each: speed of each return along its ray, m/s, positive away from the sensor.
-    times_s : array_like, optional
-        (F,) time of each scan, s.
+    points, poses, intensities, doppler_mps
+        As for :func:`fit`, but sequences. Doppler is positive away from the sensor.
+    times_s : (F,) array_like, optional
+        Time of each scan, s.
     config : FitConfig, optional
         Settings of the planned fit.
 

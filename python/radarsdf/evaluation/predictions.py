@@ -159,7 +159,8 @@ class KNNIntensity:
         """Build the baseline with the best `candidates` and `k` for these training scans.
 
         Every fifth training scan is held out and predicted from the others. The lowest mean absolute error selects
-        4 of 4, 8 of 8, or 16 of 16, 64, 128 or 256 candidates. The result uses all training scans.
+        4 of 4, 8 of 8, or 16 of 16, 64, 128 or 256 candidates. The result uses all training scans; of a single one, which cannot
+        be held out, it has the defaults of the class. Raises the errors of the class, also if `scans` are not (N,) integers.
 
         Parameters
         ----------
@@ -167,16 +168,6 @@ class KNNIntensity:
             As for the class. Pass the training scans only: a choice based on the evaluation scans is not fair.
         scans : (N,) array_like of int
             Scan number of each return. Whole scans are held out, since returns of one scan share view and noise.
-
-        Returns
-        -------
-        KNNIntensity
-            With a single scan, which cannot be held out, it has the defaults of the class.
-
-        Raises
-        ------
-        ValueError, TypeError
-            As for the class; or if `scans` are not (N,) integers.
         """
         points, values = positions(points_world, "points"), real_array(intensities, "intensities")
         sensors = np.broadcast_to(real_array(sensor_positions, "sensor positions"), points.shape)

@@ -113,16 +113,6 @@ def calibrate(scans: Scans, *, imu: Imu | None = None, config: FitConfig | None 
         If an argument has the wrong type.
     ValueError
         If there are no labels of several radars, no times, or the motion of the first radar is not observable.
-
-    Examples
-    --------
-    >>> import numpy as np, radarsdf
-    >>> drive = radarsdf.simulate.wall(frames=6)
-    >>> scans = radarsdf.io.Scans(drive.points, drive.poses)
-    >>> radarsdf.calibrate(scans)
-    Traceback (most recent call last):
-        ...
-    ValueError: calibrate needs scans of several radars: Scans(..., sensors=labels)
     """
     config = checked_settings(config)
     rig, limits = instance(scans, Scans, "scans").rig, config.returns

@@ -200,14 +200,6 @@ def drifted(poses: Floats, sigma_m: float, sigma_rad: float, seed: int = 0, yaw_
     -------
     (F, 4, 4) ndarray
         T_world_sensor, m.
-
-    Examples
-    --------
-    >>> import radarsdf
-    >>> scans = radarsdf.simulate.wall(frames=3)
-    >>> given = radarsdf.simulate.drifted(scans.poses, 0.02, 0.002)
-    >>> given.shape, bool((given[0] == scans.poses[0]).all())
-    ((3, 4, 4), True)
     """
     rng = np.random.default_rng(seed)
     errors = rng.normal(0, 1, (len(poses) - 1, 6)) * np.repeat([sigma_m, sigma_rad], 3)

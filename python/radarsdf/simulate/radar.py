@@ -348,7 +348,7 @@ class Simulation:
 
 
 def simulate(scene: Scene, sensor: RadarSensor, poses: Floats, *, name: str, seed: int = 0) -> Simulation:
-    """Scan a scene from every pose.
+    """Scan a scene once from every pose. Raises a ValueError if a pose is not a rigid transform.
 
     Parameters
     ----------
@@ -360,16 +360,6 @@ def simulate(scene: Scene, sensor: RadarSensor, poses: Floats, *, name: str, see
         Name of the simulation.
     seed : int
         Seed of all random numbers. The same arguments give the same result, bit by bit.
-
-    Returns
-    -------
-    Simulation
-        One scan per pose.
-
-    Raises
-    ------
-    ValueError
-        If a pose is not a rigid transform.
     """
     instance(scene, Scene, "scene")
     instance(sensor, RadarSensor, "sensor")

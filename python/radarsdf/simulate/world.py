@@ -300,17 +300,7 @@ class Scene:
     def raycast(self, origins: ArrayLike, directions: ArrayLike, max_range_m: float) -> Hits:
         """Find the first hit of each ray within `max_range_m`, exact to about 1e-9 m.
 
-        Parameters
-        ----------
-        origins, directions : (N, 3) array_like
-            Origins, world, m, or one origin (3,), and unit vectors, world.
-        max_range_m : float
-            Farther hits are ignored, m.
-
-        Returns
-        -------
-        Hits
-            `range_m` (N,), m, `normals` (N, 3), world, and `primitive` (N,), index in `parts`; inf, 0 and -1 without a hit.
+        `origins`: (N, 3), or one, (3,), world, m. `directions`: (N, 3) unit vectors, world.
         """
         directions = np.asarray(directions, dtype=np.float64)
         origins = np.broadcast_to(np.asarray(origins, dtype=np.float64), directions.shape)
