@@ -47,20 +47,14 @@ def block_diagonal(blocks: Floats) -> Any:
     return sparse.bsr_matrix((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
 
 
-def pose_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Any]:
-    """Poses (F, 4, 4) of the radars, and derivatives (6 F, U) of their increments."""
+def motion_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Any, Floats, Any]:
+    """Poses (F, 4, 4) and velocities (F, 3), own frames, of the radars, each followed by its derivatives (6 F, U) and (3 F, U)."""
     at, M = path.motion(radars.times_s - path.late_s[radars.of_scan]), path.mountings[radars.of_scan]
     arm = np.einsum("fij,fj->fi", at.R, M[:, :3, 3])
     by_motion, own = np.tile(np.eye(6, 12), (len(M), 1, 1)), np.zeros((len(M), 6, OF_RADAR))
     by_motion[:, :3, 3:6] = -skew(arm)
     own[:, :3, :3] = own[:, 3:, 3:6] = at.R
-    return assembled(at.R @ M[:, :3, :3], at.p + arm), path.columns(at, by_motion, own, radars.of_scan)
-
-
-def velocity_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Any]:
-    """Velocities (F, 3) of the radars in their own frames, and derivatives (3 F, U)."""
-    at, M = path.motion(radars.times_s - path.late_s[radars.of_scan]), path.mountings[radars.of_scan]
-    arm = np.einsum("fij,fj->fi", at.R, M[:, :3, 3])
+    of_poses = path.columns(at, by_motion, own, radars.of_scan)
     in_body = np.einsum("fji,fj->fi", at.R, at.v) + np.cross(at.omega, M[:, :3, 3])
     velocities = np.einsum("fji,fj->fi", M[:, :3, :3], in_body)
     speeds = np.linalg.norm(velocities, axis=1)[:, None]
@@ -68,7 +62,9 @@ def velocity_rows(path: BodyPath, radars: RadarsOfBody) -> tuple[Floats, Any]:
     by_motion = np.concatenate([0 * back, back @ skew(at.v), back, -back @ skew(arm)], axis=2)
     by_mounting = from_body @ skew(at.omega), from_body @ skew(in_body), np.zeros((len(M), 3, 1))
     own = np.concatenate([*by_mounting, speeds[:, None] * np.eye(3)], axis=2)
-    return velocities + speeds * path.shares[radars.of_scan], path.columns(at, by_motion, own, radars.of_scan)
+    velocities += speeds * path.shares[radars.of_scan]
+    of_velocities = path.columns(at, by_motion, own, radars.of_scan)
+    return assembled(at.R @ M[:, :3, :3], at.p + arm), of_poses, velocities, of_velocities
 
 
 def smooth_rows(path: BodyPath) -> tuple[Any, Floats]:

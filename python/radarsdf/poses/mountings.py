@@ -44,8 +44,7 @@ def estimate_mountings(
         H, g = sparse.diags(held).tocsr(), np.zeros(len(held))
         off = [increments(given, path.mountings), path.late_s[:, None], path.shares]
         g[num_path:] = (information * np.concatenate(off, axis=1)).ravel()
-        poses, of_poses = equations.pose_rows(path, radars)
-        velocities, of_velocities = equations.velocity_rows(path, radars)
+        poses, of_poses, velocities, of_velocities = equations.motion_rows(path, radars)
         off_mps = np.einsum("fij,fj->fi", radars.whitening, velocities - radars.mean_mps)
         robust = 1 / (1 + (off_mps**2).sum(axis=1) / (3 * _SIGMAS2))
         whitening = equations.block_diagonal(robust[:, None, None] * radars.whitening)
