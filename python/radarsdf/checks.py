@@ -119,8 +119,7 @@ def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> Floats:
     T_world_sensor: Floats = real_array(poses, "poses")
     shape = T_world_sensor.shape
     count = (shape or (0,))[0] if num_scans is None else num_scans
-    wanted = f"({count}, 4, 4), one T_world_sensor per scan"
-    check(shape == (count, 4, 4), f"poses must have shape {wanted}, not {shape}")
+    check(shape == (count, 4, 4), f"poses must have shape ({count}, 4, 4), one per scan, not {shape}")
     return T_world_sensor
 
 

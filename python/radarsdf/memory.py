@@ -14,8 +14,7 @@ def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 
     `cells`: of a map whose surface for views is not yet built; `patches` of that surface; `beams` of one view.
     """
     needed = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM
-    remedy = "use fewer poses or returns, or fit a part of the scans"
-    check_memory("these views", needed, max_memory_bytes, remedy)
+    check_memory("these views", needed, max_memory_bytes, "use fewer poses or returns, or fit fewer scans")
 
 
 def check_memory(what: str, needed_bytes: float, max_memory_bytes: int | None, remedy: str) -> None:

@@ -294,8 +294,7 @@ def _mountings(given: Floats, refined: Floats, begin: int) -> Iterator[tuple[flo
         ratio = (drift[first:] - left).sum() - 1.5 * np.log(count - first) - np.log(count) * (first > 0)
         degrees = np.degrees(Rotation.from_matrix(turn).magnitude())
         since = f" from scan {begin + first} on" if first else ""
-        turned = f"turned by {degrees:.1f} degrees against the frame of the poses{since}"
-        moves = f"The scans move as if the sensor were {turned}"
+        moves = f"The scans move as if turned by {degrees:.1f} degrees against the frame of the poses{since}"
         evidence = f"{moves} (log likelihood ratio to drift: {ratio:.0f})."
         yield float(ratio), Finding("sensor_turned", "warning", evidence)
 

@@ -162,8 +162,7 @@ def convert(given: Namespace, results: Results) -> None:
     if suffix != ".npz":
         checked_suffix(out, CLOUD_OUT_SUFFIXES, "point clouds to write")
     among = suffix in CLOUD_SUFFIXES and folder.is_dir() and folder in out.resolve().parents
-    what = "lies in the folder of the scans, where it would be read as one of them: write it elsewhere"
-    check_that(not among, f"{out} {what}")
+    check_that(not among, f"{out} would be read as one of the scans in its folder: write it elsewhere")
     add_scans(results, out, read_scans(given))
 
 

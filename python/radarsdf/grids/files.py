@@ -46,8 +46,7 @@ def write_octomap(path: Path, state: NDArray[np.int8], origin: Floats, voxel_m: 
     known = state >= 0
     keys = np.argwhere(known) + start.astype(np.int64) + _HALF
     inside = ((keys >= 0) & (keys < 2 * _HALF)).all()
-    beyond = f"more than {_HALF} voxels from the world's origin, the end of OctoMap's octree"
-    check(inside, f"the grid is {beyond}")
+    check(inside, f"the grid is beyond the end of OctoMap's octree, {_HALF} voxels from the world's origin")
     size, data = _octree(keys, np.where(state[known] == 1, _OCCUPIED, _FREE))
     header = (
         "# Octomap OcTree binary file\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"

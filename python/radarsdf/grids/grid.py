@@ -378,8 +378,7 @@ def _checked_obstacles(obstacles: ArrayLike | None) -> Floats:
     if boxes.ndim == 2:
         boxes = np.stack([boxes, boxes], axis=1)
     fits = boxes.shape[1:] == (2, 3) and np.isfinite(boxes).all() and (boxes[:, 0] <= boxes[:, 1]).all()
-    wanted = "finite points (K, 3) or boxes (K, 2, 3)"
-    check(fits, f"obstacles must be {wanted}, not {boxes.shape} or upper corners first")
+    check(fits, f"obstacles must be finite, (K, 3) or (K, 2, 3) with lower corners first, not {boxes.shape}")
     return boxes
 
 

@@ -57,8 +57,7 @@ class Track:
         """Trajectory of the poses. Damaged ones are left out and noted."""
         count = len(self.numbers) // 9
         if damaged := count - len(self.table):
-            what = f"{damaged} of {count} are not finite, with a unit quaternion"
-            request.notes.add(f"poses of {name} left out: {what}")
+            request.notes.add(f"poses of {name} left out: {damaged} of {count} are not finite and rigid")
         times_s = self.table[:, :2].T
         clock = bag_messages.Clock.of(times_s, name, request.stamps, request.notes)
         return pose_files.trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)

@@ -165,8 +165,7 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
         return {names[i]: table[:, starts[i] : starts[i + 1]].copy().view(kinds[i])[:, 0] for i in scalars}
     if form == "binary_compressed":  # one field after another
         packed, unpacked = np.frombuffer(body, "<u4", 2).tolist()
-        wanted = f"{points} points of {step} bytes"
-        check(unpacked == points * step, f"its {unpacked} unpacked bytes are not {wanted}")
+        check(unpacked == points * step, f"its {unpacked} unpacked bytes are not {points} points of {step}")
         data = unpack_lzf(body[8 : 8 + packed], unpacked)
         return {names[i]: np.frombuffer(data, kinds[i], points, points * starts[i]) for i in scalars}
     words = np.array(body.split()).reshape(points, sum(counts))

@@ -298,8 +298,7 @@ class Fields:
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
         in_degrees = are_degrees(azimuth, elevation)
         unit = "degrees" if in_degrees else "rad"
-        how = "by their values: azimuth_deg or azimuth_rad would be explicit"
-        notes.add(f"{' and '.join(names)} are taken as {unit} {how}")
+        notes.add(f"{' and '.join(names)} are taken as {unit} by their values: azimuth_rad would be explicit")
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes) -> None:

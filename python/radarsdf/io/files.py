@@ -177,5 +177,4 @@ def _lock(descriptor: int) -> None:
 def check_fits_float32(path: AnyPath, points: Floats) -> None:
     """Raise a ValueError if float32 would round points (N, 3), m, by more than a millimetre."""
     near = np.abs(points).max(initial=0.0) <= _MAX_FLOAT32_M
-    what = f"float32 coordinates are too coarse {_MAX_FLOAT32_M:g} m from the origin: write .ply"
-    check(near, f"{path}: its {what}")
+    check(near, f"{path}: float32 is too coarse {_MAX_FLOAT32_M:g} m from the origin: write .ply")

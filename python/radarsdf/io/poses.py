@@ -157,8 +157,7 @@ def trajectory_of(table: Floats, name: str, notes: Notes | None = None) -> Traje
     count = f"{(~kept).sum()} of {len(table)} poses"
     left_out = "" if kept.all() else f"{count} {why}; the first: pose {np.argmin(kept)}"
     enough = len(times_s) >= 2 and 2 * (~good & ~missing).sum() < (~missing).sum()
-    needed = "poses at different times; at least two are needed"
-    check(enough, f"{name} holds {len(times_s)} {needed}; {left_out}")
+    check(enough, f"{name} holds {len(times_s)} poses at different times, of at least two; {left_out}")
     if notes is not None and left_out:
         notes.add(f"{name}: {left_out}")
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))

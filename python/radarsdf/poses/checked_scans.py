@@ -52,8 +52,7 @@ class CheckedScans:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
         scans, _, left_out = check_scans(points)
         range_m = median_range_m(scans)
-        far = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
-        check(range_m <= _MOST_M, far)
+        check(range_m <= _MOST_M, f"points have a median range of {range_m:.0f} m: convert mm or cm to m")
         rows, notes, times_s = np.arange(len(scans)), left_out.notes, _checked_times(times, len(scans))
         times_s, repeated = _spread_times(times_s - times_s[0])
         if repeated:

@@ -382,8 +382,7 @@ class Inertial:
         if found is not None:
             return cls(found.gyroscope, found)
         if imu.R_sensor_imu is None:
-            why = "as accelerometer and Doppler do not determine it: give R_sensor_imu"
-            return cls().without(f"its rotation on the radar is unknown, {why}")
+            return cls().without("Doppler and accelerometer do not determine its rotation: give R_sensor_imu")
         rates = np.einsum("ij,gj->gi", imu.R_sensor_imu, imu.angular_velocity)
         return cls(Gyroscope.of(rates, imu.times_s, times_s))
 

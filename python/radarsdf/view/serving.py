@@ -100,8 +100,7 @@ def guarded(listening: str) -> Iterator[None]:
         yield
     finally:
         library.serve = serve
-    wrong = "this version of viser cannot be guarded against other web pages: install another"
-    check(started, wrong, RuntimeError)
+    check(started, "this viser cannot be guarded against other pages: install another version", RuntimeError)
 
 
 def start_server(host: str, port: int) -> Any:
