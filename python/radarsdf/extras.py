@@ -17,10 +17,7 @@ REQUIREMENTS = {
 
 
 def require(*modules: str, what: str) -> Any:
-    """Import optional libraries and return the last one.
-
-    `what` begins the message, such as "the viewer needs". The ImportError names all missing ones and the install command.
-    """
+    """Import libraries and return the last one. `what`, such as "the viewer needs", begins the ImportError for missing ones."""
     missing: list[str] = []
     for name in modules:
         try:

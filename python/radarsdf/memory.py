@@ -9,10 +9,7 @@ _PER_BEAM = 100.0
 
 
 def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0) -> None:
-    """Raise a MemoryError if views of a map exceed the memory.
-
-    `cells`: of a map whose surface for views is not yet built; `patches` of that surface; `beams` of one view.
-    """
+    """Raise a MemoryError for too large views: `cells` of a map whose surface is not yet built, `patches` of it, `beams` of a view."""
     needed = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM
     check_memory("these views", needed, max_memory_bytes, "use fewer poses or returns, or fit fewer scans")
 

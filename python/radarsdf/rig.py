@@ -70,10 +70,7 @@ def checked_mountings(T_body_sensor: Mapping[Any, ArrayLike]) -> dict[Label, Flo
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Radars of F scans.
-
-    The poses of their scans are T_world_body if the mountings are known, else T_world_sensor.
-    """
+    """Radars of F scans, whose poses are T_world_body if the mountings are known, else T_world_sensor."""
 
     labels: tuple[Label, ...]  # of K radars
     of_scan: Ints32  # (F,) row in `labels` of the radar of each scan

@@ -108,10 +108,7 @@ class Changes:
     common offset of intensities in words, or why they were not compared; `intensity_offset`, sensor units, or None."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
-        """List the connected components of changes of at least `min_area_m2`, m², largest first.
-
-        Each consists of faces of one kind, on one of the two surfaces.
-        """
+        """List the connected components of changes of one kind and surface, of at least `min_area_m2`, m², largest first."""
         found = []
         for surface in (self.before, self.after):
             of_faces, areas = surface.of_faces()

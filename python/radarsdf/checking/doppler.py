@@ -98,10 +98,7 @@ def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> I
 
 
 def _compare_block(recording: Scans, times_s: Floats, sign: float, wrong: str | None) -> Iterator[Finding]:
-    """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone.
-
-    `wrong`: what contradicts the Doppler of all scans.
-    """
+    """Compare successive scans: times with even ones, Doppler with one velocity. `wrong`: what contradicts that of all scans."""
     begin = max(0, (len(recording) - _BLOCK) // 2)
     rows = slice(begin, begin + _BLOCK)
     points = [np.asarray(scan, np.float64) for scan in recording.points[rows]]

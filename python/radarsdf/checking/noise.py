@@ -37,10 +37,7 @@ def check_elevation(recording: Scans) -> Iterator[Finding]:
 
 
 def check_ground(recording: Scans) -> Iterator[Finding]:
-    """Check the share of returns below the ground, such as reflections in it. The z axis of the world must be up.
-
-    The ground is the most frequent height of close returns below the sensor.
-    """
+    """Check the share of returns below the ground, the most frequent height of close returns. The z axis of the world must be up."""
     scans, upwards = some_points(recording), recording.poses[some_scans(recording), 2, :3]
     distance = np.concatenate([np.linalg.norm(scan, axis=1) for scan in scans])
     height = np.concatenate([scan @ up for scan, up in zip(scans, upwards, strict=True)])

@@ -106,10 +106,7 @@ def checked_input(
     doppler_mps: Sequence[ArrayLike] | None = None,
     times_s: ArrayLike | None = None,
 ) -> Scans:
-    """Check shapes and types and build scans; the values themselves remain to be checked.
-
-    Raises a TypeError or a ValueError that names the argument.
-    """
+    """Check shapes and types, with errors that name the argument, and build scans; the values themselves remain to be checked."""
     scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(checks.one_for_each_scan(points, "points"))]
     checks.check(scans, "points holds no scans")
     for i, scan in enumerate(scans):

@@ -240,10 +240,7 @@ def read_toml(path: AnyPath) -> dict[str, Any]:
 
 
 def to_toml(config: FitConfig) -> str:
-    """Format all settings as TOML, each below a comment that explains it.
-
-    A setting that is None is written as a comment, because TOML has no null.
-    """
+    """Format all settings as TOML, each below a comment that explains it; None becomes a comment, because TOML has no null."""
     return "\n".join(_toml_lines(config)) + "\n"
 
 

@@ -250,10 +250,7 @@ def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class _AlignmentModel:
-    """Equation above for K scans, and its parameters.
-
-    These are a rotation vector, gravity, the bias of forces, the lever arm, the time offset, and the bias of rates at knots.
-    """
+    """Equation above for K scans, of rotation vector, gravity, bias of forces, lever arm, time offset, and bias of rates."""
 
     imu: Imu
     velocities: SensorVelocities

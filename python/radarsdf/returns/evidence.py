@@ -21,10 +21,7 @@ BLOCK_BITS = np.uint64(9)
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence of a surface in each leaf cell, in the order of the cells' keys.
-
-    `information` and `hits` are sums over a leaf cell and the 26 cells around it.
-    """
+    """Evidence of a surface in each leaf cell, by key. `information` and `hits` are sums over it and its 26 neighbours."""
 
     information: Floats32  # (C,) 1 / variance of the position estimated from all returns, m⁻²
     # (C,) number of scans with returns, summed over the cells. Several returns of a scan in a cell count once there, because

@@ -228,10 +228,7 @@ Ask = Callable[[Floats32, Floats32, Floats32], Floats32]
 
 @dataclass(frozen=True)
 class Reflectance:
-    """Closed-form intensity as a function of place, direction, range and incidence.
-
-    It predicts the intensity in [0, 1], or the residual of a network.
-    """
+    """Closed-form intensity in [0, 1], or residual of a network, as a function of place, direction, range and incidence."""
 
     leaf_size_m: float  # edge of a leaf cell, m
     coefficients: Floats  # (3, 14) of the regression for each kind of surface

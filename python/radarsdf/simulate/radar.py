@@ -128,10 +128,7 @@ class RadarSensor:
         return self.threshold_db if self.floor_db is None else max(self.floor_db, self.threshold_db)
 
     def scan(self, scene: Scene, T_world_sensor: Floats, seed: int = 0, frame: int = 0) -> SimulatedScan:
-        """Scan a scene once, from a pose T_world_sensor (4, 4) float64, m.
-
-        `seed` and `frame`, the index of the scan, determine all random numbers.
-        """
+        """Scan a scene from a pose T_world_sensor (4, 4), m. `seed` and `frame`, the index of the scan, set all random numbers."""
         angles = self._beam_angles(generator(seed, frame, _BEAMS))
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
         directions = Sensor.directions(*angles.T) @ R.T

@@ -40,10 +40,7 @@ class Site:
         things: Iterable[tuple[str, tuple[int, int], tuple[float, float]]],
         place: Callable[[float, float], tuple[Floats, float]],
     ) -> None:
-        """Add numbers of things, by the names of their methods, at positions and yaws that `place` draws within limits.
-
-        Each has ten tries, and is omitted if all fail.
-        """
+        """Add numbers of things, by the names of their methods, at places that `place` draws, unless ten tries of one fail."""
         for name, counts, limits in things:
             for _ in range(int(self.rng.integers(*counts))):
                 any(getattr(self, name)(*place(*limits)) for _ in range(10))
