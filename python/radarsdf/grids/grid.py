@@ -183,7 +183,7 @@ class Grid:
         return np.equal(self.state, UNKNOWN)
 
     def centres(self, which: Bools | None = None) -> Floats:
-        """Return the centres (N, 3), world, m, in C order, of all voxels, or of those in the mask `which`, such as :attr:`free`."""
+        """Return the centres (N, 3) float64, world, m, in C order, of all voxels, or of a mask (X, Y, Z), such as :attr:`free`."""
         voxels = np.argwhere(np.ones(self.shape, bool) if which is None else which)
         return self.origin + (voxels + 0.5) * self.voxel_size
 

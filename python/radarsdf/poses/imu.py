@@ -250,7 +250,7 @@ def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class _AlignmentModel:
-    """Equation above for K scans, of rotation vector, gravity, bias of forces, lever arm, time offset, and bias of rates."""
+    """Equation above for K scans, of rotation vector, gravity, bias of forces, lever arm, time offset, bias of rates at knots."""
 
     imu: Imu
     velocities: SensorVelocities
