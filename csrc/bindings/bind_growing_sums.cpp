@@ -13,14 +13,17 @@ void bind_growing_sums(py::module_& m) {
       .def(
           "collect",
           [](SumsChange& change, const Array<float>& points, const Array<float>& directions,
-             const Array<float>& ranges_m, int sign) {
+             const Array<float>& ranges_m, const Array<std::int32_t>& weights, int sign) {
             const std::int64_t count = check_rays(points, directions, ranges_m);
+            check_shape(weights, {count}, "weights");
             if (sign != 1 && sign != -1) throw std::invalid_argument("sign must be 1 or -1");
             const py::gil_scoped_release release;
-            change.collect({points.data(), directions.data(), ranges_m.data(), count}, sign);
+            change.collect({points.data(), directions.data(), ranges_m.data(), weights.data(), count}, sign);
           },
-          "points"_array, "directions"_array, "ranges_m"_array, "sign"_a,
-          "Adds (1) or removes (-1) a scan: `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.")
+          "points"_array, "directions"_array, "ranges_m"_array, "weights"_array, "sign"_a,
+          "Adds (1) or removes (-1) a scan: `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m; "
+          "and "
+          "positive `weights` (N,) int32, with which the sums are multiplied.")
       .def(
           "block_keys", [](const SumsChange& change) { return to_array(change.block_keys()); },
           "Ascending keys of the blocks that may change, uint64.");

@@ -49,10 +49,9 @@ void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
     }
     std::uint64_t terms[kSums];
     sum_terms(point, direction, rays.ranges_m[i], corner, quanta, terms);
-    for (int k = 0; k < kSums; ++k) {
-      cell.sums[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(cell.sums[k]) +
-                                               static_cast<std::uint64_t>(sign) * terms[k]);
-    }
+    const auto weight = static_cast<std::uint64_t>(sign * rays.weights[i]);
+    for (int k = 0; k < kSums; ++k)
+      cell.sums[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(cell.sums[k]) + weight * terms[k]);
     if (cell.last != scan) {
       cell.last = scan;
       cell.scans += sign;

@@ -14,9 +14,10 @@ namespace radarsdf {
 
 // The rays of one scan.
 struct RaysOfScan {
-  const float* points;      // (count, 3), local frame, m
-  const float* directions;  // (count, 3), unit vectors
-  const float* ranges_m;    // (count,)
+  const float* points;          // (count, 3), local frame, m
+  const float* directions;      // (count, 3), unit vectors
+  const float* ranges_m;        // (count,)
+  const std::int32_t* weights;  // (count,), positive
   std::int64_t count;
 };
 

@@ -578,10 +578,11 @@ class SumsChange:
         points: numpy.typing.NDArray[numpy.float32],
         directions: numpy.typing.NDArray[numpy.float32],
         ranges_m: numpy.typing.NDArray[numpy.float32],
+        weights: numpy.typing.NDArray[numpy.int32],
         sign: typing.SupportsInt | typing.SupportsIndex,
     ) -> None:
         """
-        Adds (1) or removes (-1) a scan: `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.
+        Adds (1) or removes (-1) a scan: `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m; and positive `weights` (N,) int32, with which the sums are multiplied.
         """
 
 class GrowingSums:

@@ -98,20 +98,24 @@ def check_scan_shape(scan: Array, number: int) -> None:
 
 
 def values_of_scans(
-    given: Iterable[Any], scans: Sequence[Array], name: str, convert: Callable[[Any, str], Array] = real_array
+    given: Iterable[Any],
+    scans: Sequence[Array],
+    name: str,
+    convert: Callable[[Any, str], Array] = real_array,
+    *columns: int,
 ) -> list[Array]:
-    """Convert to one array (N,) for each scan (N, 3). Raise a TypeError or a ValueError if they do not match."""
+    """Convert to one array (N, *columns) for each scan (N, 3). Raise a TypeError or a ValueError if they do not match."""
     each = enumerate(one_for_each_scan(given, name))
     values = [convert(value, f"{name} of scan {i}") for i, value in each]
     check(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
-        check_values_of_scan(value, scan, name, i)
+        check_values_of_scan(value, scan, name, i, *columns)
     return values
 
 
-def check_values_of_scan(value: Array, scan: Array, name: str, number: int) -> None:
-    fits = value.shape == (len(scan),)
-    check(fits, f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}")
+def check_values_of_scan(value: Array, scan: Array, name: str, number: int, *columns: int) -> None:
+    shape = len(scan), *columns
+    check(value.shape == shape, f"{name} of scan {number} must have shape {shape}, not {value.shape}")
 
 
 def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> Floats:

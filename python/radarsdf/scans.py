@@ -209,7 +209,7 @@ class Scans:
 
     @property
     def sigmas(self) -> list[Array] | None:
-        """F arrays (N_i, 3), m, rad, rad, see `Scan.sigma`; None if not available."""
+        """F arrays (N_i, 3), m, rad, rad, see `Scan.sigma`, NaN where unknown; None if not available."""
         return self._loaded()["sigmas"]
 
     @property
@@ -323,7 +323,16 @@ def chosen(arrays: Sequence[Any] | None, numbers: Ints | Sequence[int]) -> list[
 
 def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
     """Collect arrays by their names in :class:`Scans`: one per scan, or None where a scan has none."""
-    return {name: all_or_none([getattr(scan, own) for scan in scans]) for name, own in _ARRAYS.items()}
+    arrays = {name: all_or_none([getattr(scan, own) for scan in scans]) for name, own in _ARRAYS.items()}
+    return arrays | {"sigmas": all_or_nan([scan.sigma for scan in scans], [scan.points for scan in scans])}
+
+
+def all_or_nan(sigmas: Sequence[Array | None], points: Sequence[Array]) -> list[Array] | None:
+    """Return stated deviations (N_i, 3) of scans `points` (N_i, 3), NaN where unknown: not all radars state them. None if none does."""
+    if all(own is None for own in sigmas):
+        return None
+    each = zip(sigmas, points, strict=True)
+    return [np.full((len(scan), 3), np.float32(np.nan)) if own is None else own for own, scan in each]
 
 
 def all_or_none(values: list[_Value | None]) -> list[_Value] | None:

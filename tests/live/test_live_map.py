@@ -11,10 +11,12 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
 from radarsdf.live.surface import regions_of
+from radarsdf.scans import Scans
 
 from bench.live.removal import state
 
 from ..conftest import ground_and_wall, pose
+from ..returns.walls import distance_from_wall_m, stated_wall
 
 ORIGIN = (2.0, 0.0, 1.0)
 KNOWN = {"range_noise_m": 0.02, "azimuth_noise_rad": 1e-3, "elevation_noise_rad": 1e-3}
@@ -131,6 +133,25 @@ def test_map_and_finish_equal_fits_of_all_scans():
         mesh = found.mesh(0.2)
         at = mesh.vertices[:50], poses[0][:3, 3]
         assert found.intensity(*at).tobytes() == fitted.intensity(*at).tobytes()
+
+
+def test_returns_are_weighted_by_their_stated_deviations(tmp_path):
+    points, poses, sigmas = stated_wall()
+    equal, stated = LiveMap(FitConfig.quick()), LiveMap(FitConfig.quick(), folder=tmp_path / "live")
+    for scan, at, own in zip(points, poses, sigmas, strict=True):
+        equal.integrate(scan, at)
+        last = stated.integrate(scan, at, sigmas=own).scan_id
+    assert distance_from_wall_m(stated.mesh()) < 0.8 * distance_from_wall_m(equal.mesh())
+    stated.save(tmp_path / "live.npz")
+    again = LiveMap.load(tmp_path / "live.npz")
+    assert mesh_bits(again.mesh()) == mesh_bits(stated.mesh())
+    given = {"config": FitConfig.quick(), "origin": stated.origin}
+    assert map_bits(again.finish()) == map_bits(radarsdf.fit(Scans(points, poses, sigmas=sigmas), **given))
+    fewer = LiveMap(FitConfig.quick())
+    for scan, at, own in zip(points[:-1], poses, sigmas, strict=False):
+        fewer.integrate(scan, at, sigmas=own)
+    stated.remove(last)
+    assert state(stated) == state(fewer)
 
 
 def test_concurrent_readers_see_the_map_before_or_after_a_scan():

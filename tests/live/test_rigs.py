@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
+from radarsdf.interrupts import at_once
+from radarsdf.live.sums import RadarSums
 from radarsdf.poses.rigid import aligned
 from radarsdf.poses.search import Lost
+from radarsdf.returns.evidence import BLOCK_BITS
+from radarsdf.returns.noise import RigNoise, SensorNoise
+from radarsdf.returns.rays import prepare
+from radarsdf.returns.sums import WEIGHT_UNIT, MeanRays, ScanSums
 from radarsdf.simulate import simulate_rig
 
 from scenes.kinds import KINDS
@@ -118,3 +124,20 @@ def test_scans_of_a_radar_far_from_the_body_are_sealed_beyond_a_ball():
     live.integrate(np.tile([10.0, 0, 0], (5, 1)) + 0.1 * np.arange(5)[:, None], np.eye(4), sensor="front")
     live.clear_outside([0, 0, 0], 12.0)
     assert live.sealed_scans == 1
+
+
+def test_cells_with_very_many_returns_keep_their_mean():
+    """The sums of two radars, weighted by their noise, exceed 64 bits after half an hour at one place."""
+    sums, corner = (
+        RadarSums(2),
+        ScanSums.of(prepare([[[0.19, 0.01, 0.1]]], [np.eye(4)], origin=[0, 0, 0]), 0.2),
+    )
+    many = corner.sums * WEIGHT_UNIT * 10_000_000
+    blocks = corner.keys >> BLOCK_BITS
+    columns = corner.keys, many, np.ones(1, np.uint32), blocks, np.ones(1, np.uint32)
+    at_once(*sums.insert([columns, columns]))
+    noises = SensorNoise(0.1, 0.01, 0.01), SensorNoise(0.05, 0.005, 0.005)
+    found = sums.weighted(0.2, RigNoise(*noises[0].deviations, noises, (26, 102)))
+    np.testing.assert_allclose(MeanRays.of_sums(found).points, [[0.19, 0.01, 0.1]], atol=1e-5)
+    _, moments = found.merged_moments()
+    np.testing.assert_allclose(moments[0, 4] / moments[0, 0], 0.19**2, rtol=1e-4)

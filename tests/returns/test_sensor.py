@@ -15,7 +15,7 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.scans import Scans
 
 from ..conftest import ground_and_wall, pose
-from .walls import a_wall
+from .walls import a_wall, distance_from_wall_m, stated_wall
 
 NOISE = SensorNoise(0.1, 0.01, 0.02)
 
@@ -133,20 +133,12 @@ def test_given_noise_is_kept():
     assert dataclasses.astuple(noise_of(rays, **known)) == pytest.approx((0.5, 0.2, 0.1))
 
 
-def stated_wall():
-    """Scans of a wall; every second has five times the noise; deviations of elevation are overstated 100 times."""
-    walls = [a_wall(scale * 0.03, scale * 0.003) for scale in (1, 5)]
-    points = [walls[i % 2][0][i] for i in range(8)]
-    sigmas = [np.tile([0.03, 0.003, 0.3], (len(p), 1)) * (1, 5)[i % 2] for i, p in enumerate(points)]
-    return points, walls[0][1], sigmas
-
-
 def test_stated_deviations_are_scaled_by_the_returns():
     points, poses, sigmas = stated_wall()
     rays = prepare(points, poses, sigmas=sigmas)
     typical = noise_of(rays).deviations / np.median(np.concatenate(sigmas), axis=0)
     assert typical == pytest.approx([1, 1, 0.01], rel=0.4)
-    precise = rays.scans % 2 == 0
+    precise = np.concatenate(sigmas)[:, 0] < 0.1
     weights = noise_of(rays).weights(rays)
     assert np.median(weights[precise]) == pytest.approx(25 * np.median(weights[~precise]), rel=0.05)
     kept = without_false_deviations(rays, LEAF_M, ReturnsConfig(), 1)
@@ -155,20 +147,18 @@ def test_stated_deviations_are_scaled_by_the_returns():
 
 def test_deviations_that_the_returns_contradict_are_left_out(caplog):
     points, poses, sigmas = stated_wall()
-    rays = prepare(points, poses, sigmas=[*sigmas[1:], sigmas[0]])
+    rays = prepare(points, poses, sigmas=[np.roll(own, 1, axis=0) for own in sigmas])
     assert without_false_deviations(rays, LEAF_M, ReturnsConfig(), 1).stated is None
     assert "deviations stated by the sensor" in caplog.text
 
 
-def test_a_fit_weighs_returns_by_their_stated_deviations():
+@pytest.mark.parametrize("config", [FitConfig.quick(), FitConfig()])
+def test_a_fit_weighs_returns_by_their_stated_deviations(config):
+    def off_m(drive):
+        return distance_from_wall_m(radarsdf.fit(drive, config=config, progress=False).mesh(0.1))
+
     points, poses, sigmas = stated_wall()
-    for config in (FitConfig.quick(), FitConfig()):
-        off_m = []
-        for stated in (None, sigmas):
-            drive = Scans(points, poses, sigmas=stated)
-            x, y, z = radarsdf.fit(drive, config=config, progress=False).mesh(0.1).vertices.T
-            off_m.append(np.abs(x[(np.abs(y) < 4) & (z > 0.7) & (z < 3.5)] - 15).mean())
-        assert off_m[1] < 0.8 * off_m[0]
+    assert off_m(Scans(points, poses, sigmas=sigmas)) < 0.8 * off_m(Scans(points, poses))
 
 
 def test_few_returns_fall_back_to_the_default():

@@ -33,3 +33,18 @@ def a_wall(
         is_ghost.append(np.arange(len(points[-1])) >= len(measured))
         poses.append(T_world_sensor)
     return points, np.stack(poses), np.concatenate(is_ghost)
+
+
+def stated_wall():
+    """Scans of a wall; every second return has five times the noise; deviations of elevation are overstated 100 times."""
+    walls = [a_wall(scale * 0.03, scale * 0.003) for scale in (1, 5)]
+    points = [
+        np.where(np.arange(len(a))[:, None] % 2, b, a) for a, b in zip(walls[0][0], walls[1][0], strict=True)
+    ]
+    scales = [np.where(np.arange(len(scan)) % 2, 5, 1)[:, None] for scan in points]
+    return points, walls[0][1], [scale * [0.03, 0.003, 0.3] for scale in scales]
+
+
+def distance_from_wall_m(mesh):
+    x, y, z = mesh.vertices.T
+    return np.abs(x[(np.abs(y) < 4) & (z > 0.7) & (z < 3.5)] - 15).mean()

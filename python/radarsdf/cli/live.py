@@ -81,6 +81,7 @@ def replay(
                 doppler_mps=scan.doppler_mps,
                 time_s=scan.time_s,
                 sensor=scan.sensor,
+                sigmas=scan.sigma,
             )
         except unusable as error:
             why = f"The last scan that was lost: {error}"

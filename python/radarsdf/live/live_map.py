@@ -29,7 +29,7 @@ from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex
 from radarsdf.returns.moving import moving_returns
 from radarsdf.returns.rays import check_scans
 from radarsdf.rig import Label, Mounted, checked_mountings
-from radarsdf.scans import Scans, all_or_none
+from radarsdf.scans import Scans, all_or_nan, all_or_none
 
 _MOST_UNPLACED = 10 * SUBMAP_SCANS  # lost scans to search the map for
 _RANGED = 100  # scans from which the median range is known
@@ -210,6 +210,7 @@ class LiveMap:
         time_s: float | None = None,
         scan_id: ScanId | None = None,
         sensor: Label | None = None,
+        sigmas: ArrayLike | None = None,
     ) -> Integrated:
         """Add a scan of N returns.
 
@@ -234,6 +235,9 @@ class LiveMap:
             Identifier of the scan; with a folder, a string or an integer of 64 bits. Default: a consecutive number.
         sensor : hashable, optional
             Label of its radar in `T_body_sensor`. Required in the map of a rig, whose radars may measure at the same time.
+        sigmas : (N, 3) array_like, optional
+            Deviations of range, azimuth and elevation that the sensor states, m, rad, rad. Returns are weighted by them, relative
+            to the medians of their scan. :meth:`finish` also tests them, as :func:`radarsdf.fit`.
 
         Returns
         -------
@@ -247,7 +251,7 @@ class LiveMap:
         Lost
             If a scan without a pose cannot be registered with the last ones; a ValueError.
         """
-        scan, far = self._check(points, intensities, doppler_mps, time_s)
+        scan, far = self._check(points, intensities, doppler_mps, time_s, sigmas)
         mountings = self._state.mountings
         known = sensor is None if mountings is None else sensor in mountings
         check(known, f"sensor must be one of T_body_sensor, {list(mountings or ())}, not {sensor!r:.50}")
@@ -498,6 +502,7 @@ class LiveMap:
             [scan.points for scan in scans],
             poses,
             doppler_mps=all_or_none([scan.doppler_mps for scan in scans]),
+            sigmas=all_or_nan([scan.sigmas for scan in scans], [scan.points for scan in scans]),
             sensors=None if self._state.mountings is None else [scan.label for scan in scans],
             T_body_sensor=self._state.mountings,
             **known,
@@ -509,6 +514,7 @@ class LiveMap:
         intensities: ArrayLike | None,
         doppler_mps: ArrayLike | None,
         time_s: float | None,
+        sigmas: ArrayLike | None,
     ) -> tuple[LoggedScan, int]:
         """Check a scan, without a pose yet, and count returns too far away. Raise a ValueError if it is invalid."""
         scans, values, left_out = check_scans([points], None if intensities is None else [intensities])
@@ -524,4 +530,8 @@ class LiveMap:
             time_s, latest = checks.number(time_s, "time_s"), checks.MAX_TIME_S
             check(abs(time_s) <= latest, f"time_s must be finite and within {latest:g} s, not {time_s:g}")
         values_of_scan = None if values is None else values[0].copy()
-        return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s), left_out.far
+        stated = None if sigmas is None else checks.real_array(sigmas, "sigmas", np.float32).copy()
+        if stated is not None:
+            checks.check_values_of_scan(stated, scan, "sigmas", 0, 3)
+        held = compact(scan), values_of_scan, speeds, stated, static
+        return LoggedScan(np.eye(4), *held, time_s), left_out.far

@@ -25,13 +25,16 @@ from radarsdf.returns.noise import SensorNoise, rig_noise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sensor import Radars
-from radarsdf.returns.sums import lattice_of
+from radarsdf.returns.sums import WEIGHT_UNIT, lattice_of
 from radarsdf.rig import Label, Rig
+from radarsdf.scans import all_or_nan
 from radarsdf.threads import resolve_num_threads
 
 _Scans = dict[ScanId, LoggedScan]
 _SAVED = ("noise", "noise_of", "next_id", "with_intensities")  # attributes saved as they are
-_UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # placeholder until it is estimated from scans
+_USUAL = SensorNoise(
+    0.1, 0.01, 0.01
+)  # until it is estimated from scans, and for weights that depend on a scan alone
 _NOISE_RETURNS = 100_000  # sample for the noise, enough to include the required returns on flat surfels
 # Rays of a fit, for free space and intensities, which take 100 bytes each: surfaces are those of the sums of all.
 _FIT_RETURNS = 4_000_000
@@ -64,7 +67,7 @@ class GrowingState:
         self._num_threads = resolve_num_threads(config.num_threads)
         self._labels: list[Label | None] = [None] if mountings is None else [*mountings]
         self.sums = RadarSums(len(self._labels))
-        self.noise = _UNKNOWN
+        self.noise = _USUAL
         self.with_intensities: bool | None = None
         self.next_id = 0
         self.number = 0  # of the state of the sums: another one after each change
@@ -100,7 +103,9 @@ class GrowingState:
             for scan in scans.values():
                 rays = self._rays_of([scan], self.origin if new["origin"] is None else new["origin"])
                 change = changes[self._labels.index(scan.label)]
-                change.collect(rays.points, rays.directions, rays.ranges_m, sign)
+                weights = _USUAL.weights(rays)
+                weights = np.full(len(rays), WEIGHT_UNIT, np.int32) if weights is None else weights
+                change.collect(rays.points, rays.directions, rays.ranges_m, weights, sign)
         for change in changes:
             self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
         return self._commit(self.sums.apply(changes), None, **new)
@@ -236,7 +241,7 @@ class GrowingState:
         scans = len(self.log)
         if self.noise_of / 2 < scans < 2 * self.noise_of:
             return
-        sums = self.sums.weighted(self.config.leaf_size_m, _UNKNOWN)
+        sums = self.sums.weighted(self.config.leaf_size_m, _USUAL)
         asked = list(self.log.scans(every=max(1, int(sums.counts.sum()) // _NOISE_RETURNS)))
         if asked:
             estimate = sensor_noise if self.mountings is None else rig_noise
@@ -251,8 +256,10 @@ class GrowingState:
         static = [scan.static for scan in scans]
         poses = np.stack([scan.T_world_sensor for scan in static])
         values = [scan.intensities for scan in static if scan.intensities is not None] or None
+        points, stated = [scan.points for scan in static], [scan.sigmas for scan in static]
         options = self.config.preparation | {"origin": origin, "whole": False, "rig": self._rig_of(static)}
-        return prepare([scan.points for scan in static], poses, values, **options)
+        rays = prepare(points, poses, values, sigmas=all_or_nan(stated, points), **options)
+        return rays.with_relative_deviations()
 
     def _rig_of(self, scans: Sequence[LoggedScan]) -> Rig | None:
         return None if self.mountings is None else Rig.of([scan.label for scan in scans], self.mountings)

@@ -27,7 +27,7 @@ from radarsdf.rig import Label, Mounted, checked_mountings
 
 ScanId = Hashable
 # Arrays of a scan, and their types.
-_KINDS = {"points": "f", "intensities": "f", "doppler_mps": "f", "is_static": "b"}
+_KINDS = {"points": "f", "intensities": "f", "doppler_mps": "f", "sigmas": "f", "is_static": "b"}
 
 # A file in the locked folder is used only once it is complete, so it needs no temporary one, as the state does.
 _save: Callable[..., None] = np.savez
@@ -66,6 +66,7 @@ class LoggedScan:
     points: Array  # (N, 3) sensor frame, m: float32 if that is lossless, else float64
     intensities: Floats32 | None = None  # (N,) sensor units
     doppler_mps: Array | None = None  # (N,) radial speed
+    sigmas: Array | None = None  # (N, 3) deviations that the sensor states, m, rad, rad
     is_static: Bools | None = None  # (N,) mask of the static returns, those in the map. None: all
     time_s: float | None = None
     radar: Mounted | None = None  # of several. `pose` is then T_world_body
@@ -208,7 +209,7 @@ class ScanLog:
         _, _, pose, time_s, tracked, radar, *blobs = row
         stored = {name: blob for name, blob in zip(_KINDS, blobs, strict=True) if blob is not None}
         held: dict[str, Any] = {n: np.frombuffer(b, chr(b[0]), offset=1).copy() for n, b in stored.items()}
-        held["points"] = held["points"].reshape(-1, 3)
+        held |= {name: held[name].reshape(-1, 3) for name in ("points", "sigmas") if name in held}
         mounted = None if radar is None else self._radars[radar]
         return LoggedScan(_pose_of(pose), **held, time_s=time_s, radar=mounted, tracked=bool(tracked))
 
@@ -352,7 +353,7 @@ class Described(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-    format: Literal[5] = 5
+    format: Literal[6] = 6
     config: dict[str, Any]
     origin: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
     noise: RigNoise | SensorNoise
@@ -401,7 +402,7 @@ def load_state(path: AnyPath) -> tuple[Described, list[LoggedScan], list[tuple[A
             points = checks.positions(held["points"], "points")
             for name, array in held.items():
                 if name != "points":
-                    checks.check_values_of_scan(array, points, name, 0)
+                    checks.check_values_of_scan(array, points, name, 0, *[3] * (name == "sigmas"))
                 check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
             mounted = radars[k] if radars else None
             known: dict[str, Any] = {"time_s": time_s, "radar": mounted, "tracked": scan_id in tracked}

@@ -12,9 +12,11 @@ from radarsdf.returns.evidence import VisibilityCounts
 from radarsdf.returns.noise import RigNoise, SensorNoise
 from radarsdf.returns.sums import WEIGHT_UNIT, ScanSums
 
+_MOST_RETURNS = 2**16  # in a cell, of a radar of a rig
+
 
 class RadarSums:
-    """Sums in cells and visibility counts of blocks, of K radars. Changes are calls for :func:`at_once`, K each."""
+    """Sums in cells, in parts of 1 / `WEIGHT_UNIT`, and visibility counts of blocks, of K radars. Changes are calls for :func:`at_once`, K each."""
 
     def __init__(self, num_radars: int) -> None:
         self._tables = [GrowingSums() for _ in range(num_radars)]
@@ -54,9 +56,11 @@ class RadarSums:
         keys, sums, scans = zip(*(table.sums_of(blocks) for table in self._tables), strict=True)
         total_scans = _total(keys, scans)[1]
         if not isinstance(noise, RigNoise):
-            return ScanSums(leaf_size_m, *_total(keys, sums), total_scans)
-        weighted = [part * own for part, own in zip(noise.parts, sums, strict=True)]
-        return ScanSums(leaf_size_m, *_total(keys, weighted), total_scans, WEIGHT_UNIT)
+            return ScanSums(leaf_size_m, *_total(keys, sums), total_scans, WEIGHT_UNIT)
+        # Of more returns, a cell keeps mean and scatter: products would overflow once a robot is parked for half an hour.
+        bounded = (own // (1 + own[:, :1] // (WEIGHT_UNIT * _MOST_RETURNS)) for own in sums)
+        weighted = [part * own for part, own in zip(noise.parts, bounded, strict=True)]
+        return ScanSums(leaf_size_m, *_total(keys, weighted), total_scans, WEIGHT_UNIT**2)
 
     def visibility(self) -> VisibilityCounts:
         blocks = self.block_keys()

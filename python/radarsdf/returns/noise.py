@@ -132,7 +132,7 @@ def _stated_weights(noise: SensorNoise, rays: Rays) -> Floats:
         along, azimuth, elevation = own.variances
         usual = along + ranges2 * (azimuth + elevation)
         of_rows = usual / (along * factors[0] + ranges2 * (azimuth * factors[1] + elevation * factors[2]))
-        weights[rows] = of_rows / of_rows.mean()
+        weights[rows] = of_rows * (len(of_rows) / max(of_rows.sum(), _LEAST_VARIANCE))
     return weights
 
 
@@ -197,10 +197,19 @@ def _residuals(surfels: Surfels, rays: Rays, num_threads: int) -> tuple[Floats, 
 
 
 def without_false_deviations(rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_threads: int) -> Rays:
-    """Leave out the stated deviations of radars whose returns have a more precise mean if all weigh the same."""
+    """Leave out the stated deviations of radars that are not :func:`credible_deviations`."""
     if rays.stated is None:
         return rays
-    surfels, stated = Surfels.of(rays, leaf_size_m, num_threads), np.ones_like(rays.stated)
+    credible = credible_deviations(rays, leaf_size_m, config, num_threads)
+    known = [np.ones(3) if told else np.full(3, np.nan) for told in credible]
+    return rays.with_relative_deviations(known) if any(credible) else replace(rays, stated=None)
+
+
+def credible_deviations(
+    rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_threads: int
+) -> list[bool]:
+    """Return whether the stated deviations of each radar, as weights, make the mean of its returns no less precise."""
+    surfels, credible = Surfels.of(rays, leaf_size_m, num_threads), []
     for rows in rays.rows_of_sensors():
         own, means_m2 = rays.select(rows), []
         variances = sensor_noise(surfels, own, config, num_threads).variances
@@ -208,14 +217,12 @@ def without_false_deviations(rays: Rays, leaf_size_m: float, config: ReturnsConf
             residual2, shares = _residuals(surfels, part, num_threads)
             weights = 1 / np.einsum("k,kn->n", variances, shares)
             means_m2.append(np.sum(weights**2 * residual2) / max(np.sum(weights) ** 2, _LEAST_VARIANCE))
-        if means_m2[0] < means_m2[1]:
-            stated[rows] = own.stated
-    if (stated != 1).any():
-        return replace(rays, stated=stated)
-    _LOG.warning(
-        "Left out: deviations stated by the sensor. Returns of equal weight have a more precise mean."
-    )
-    return replace(rays, stated=None)
+        credible.append(bool(means_m2[0] <= means_m2[1]))
+    if not all(credible):
+        _LOG.warning(
+            "Left out: deviations stated by the sensor. Returns of equal weight have a more precise mean."
+        )
+    return credible
 
 
 def variances_across(rays: Rays, rows: Ints, normals: Floats, noise: SensorNoise) -> Floats:

@@ -23,6 +23,7 @@ _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repea
 # range needs 80 dB more than the median one. Birds have about -30 dBsm, ships and buildings at most about 50 dBsm.
 _MOST_RATIO = 100.0
 _MOST_STATED = 8.0  # times the median, or the median times this: weights are multiples of 1 / 64
+_IN_FLOAT32 = functools.partial(checks.real_array, dtype=np.float32)
 _SAME_SQUARE = 1e-6  # relative difference of squares of ranges that are equal but for float32
 
 
@@ -46,7 +47,8 @@ class Rays:
     # (F,) row of the radar of each scan in its :class:`Rig`. None: there is one
     sensor_of_scan: Ints32 | None = None
     num_sensors: int = 1
-    # (N, 3) deviations of range, azimuth and elevation that the sensor states, divided by their medians. None: it states none
+    # (N, 3) deviations of range, azimuth and elevation that the sensor states, divided by their medians; m, rad, rad before
+    # :meth:`with_relative_deviations`. None: it states none
     stated: Floats32 | None = None
 
     def __len__(self) -> int:
@@ -75,13 +77,14 @@ class Rays:
             kept[own] = Plausible.of(kept[own], keys[own]).kept(kept[own])
         return replace(self, intensities=kept)
 
-    def with_stated(self, sigmas: Floats32) -> "Rays":
-        """Return rays with the deviations (N, 3) that the sensors state, m, rad, rad. Where one is not positive, it is the median."""
-        stated = np.where(sigmas > 0, sigmas, np.float32(np.nan))
-        for rows in self.rows_of_sensors():
-            known = [column[np.isfinite(column)] for column in stated[rows].T]
-            stated[rows] /= [np.median(column) if len(column) else 1.0 for column in known]
-        stated = np.where(np.isfinite(stated), stated, np.float32(1))
+    def with_relative_deviations(self, medians: Sequence[Array] | None = None) -> "Rays":
+        """Divide stated deviations by the `medians` (3,) of each radar; None: of its rays. Where one is unknown, the ratio is 1."""
+        if self.stated is None:
+            return self
+        stated = self.stated.copy()
+        for i, rows in enumerate(self.rows_of_sensors()):
+            stated[rows] /= median_deviations(stated[rows]) if medians is None else medians[i]
+        stated = np.where((stated > 0) & np.isfinite(stated), stated, np.float32(1))
         return replace(self, stated=stated.clip(1 / _MOST_STATED, _MOST_STATED))
 
     def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> "Rays":
@@ -97,6 +100,12 @@ class Rays:
         """Return the returns and their sensor positions, (N, 3) each, float64, world, m."""
         points = self.points.astype(np.float64) + self.origin
         return points, points - self.directions.astype(np.float64) * self.ranges_m[:, None]
+
+
+def median_deviations(sigmas: Array) -> Floats:
+    """Return the medians (3,) of the positive ones of stated deviations (N, 3); NaN if there are none."""
+    known = [column[(column > 0) & np.isfinite(column)] for column in sigmas.T]
+    return np.array([np.median(column) if len(column) else np.nan for column in known])
 
 
 def measured(scan: Array) -> Bools:
@@ -180,16 +189,8 @@ def check_scans(
     checks.check(scans, "points holds no scans")
     if intensities is None:
         return scans, None, left_out
-    in_float32 = functools.partial(checks.real_array, dtype=np.float32)
-    values = checks.values_of_scans(intensities, scans, "intensities", in_float32)
+    values = checks.values_of_scans(intensities, scans, "intensities", _IN_FLOAT32)
     return scans, [np.where(np.isfinite(v), v, np.float32(np.nan)) for v in values], left_out
-
-
-def _checked_sigmas(sigmas: Iterable[ArrayLike], scans: Sequence[Array]) -> Floats32:
-    each = [checks.real_array(own, "sigmas", np.float32) for own in sigmas]
-    fits = [own.shape for own in each] == [(len(scan), 3) for scan in scans]
-    checks.check(fits, "sigmas must have shape (N_i, 3) for each scan: range, azimuth and elevation")
-    return np.concatenate(each)
 
 
 def _lengths(vectors: Floats) -> Floats:
@@ -231,7 +232,7 @@ def prepare(
     `rig`: the radars of the scans, if there are several. `sigmas` (N_i, 3): deviations that the sensor states, m, rad, rad.
     The default `origin` is the mean sensor position, rounded to the nearest block corner of the `lattice`, so that maps of
     different scans share their cells. `whole` False: the scans are a part of a set, which need not have returns within the
-    ranges, and intensity outliers are not replaced by NaN.
+    ranges, intensity outliers are not replaced by NaN, and stated deviations not divided by their medians.
 
     Rows that are not returns (not finite, 0 0 0, padding), returns at 100 times the median range of their scan and scans with a pose that is not rigid are dropped, with a warning
     of the logger ``radarsdf.returns``. Raises a ValueError if lengths or shapes do not match, half of the poses or more are
@@ -266,7 +267,9 @@ def prepare(
     rays = Rays(*columns, T_world_sensor[:, :3, 2].copy(), left_out.given, *of_rig)
     rays = rays.without_outliers() if whole else rays
     if sigmas is not None:
-        rays = rays.with_stated(_checked_sigmas(sigmas, scans)[kept])
+        of_scans = checks.values_of_scans(sigmas, scans, "sigmas", _IN_FLOAT32, 3)
+        rays = replace(rays, stated=np.concatenate(of_scans)[kept])
+        rays = rays.with_relative_deviations() if whole else rays
     if rays.intensities is not None and whole:
         fits = rays.with_intensity.any()
         checks.check(fits, "no intensity is finite: omit intensities if the sensor does not measure them")
