@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.io import Scan
+from radarsdf.io import Scan, Scans
 from radarsdf.io.files import take_lock
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
@@ -18,6 +18,7 @@ from radarsdf.tiles.plan import Plan, map_path
 
 from scenes.rigs import drive_of_rig
 
+from ..returns.walls import distance_from_wall_m, stated_wall
 from .cluster import bits_of
 from .conftest import CONFIG, TILE_M
 
@@ -25,6 +26,21 @@ from .conftest import CONFIG, TILE_M
 def tiles_of(drive, out, **arguments):
     given = {"tile_size": TILE_M, "halo": 6.4, "config": CONFIG, "progress": False} | arguments
     return radarsdf.fit_tiles(drive, out, **given)
+
+
+def test_returns_are_weighted_by_their_stated_deviations(tmp_path, caplog):
+    points, poses, sigmas = stated_wall()
+    false = [np.roll(own, 1, axis=0) for own in sigmas]
+    off_m = []
+    for i, own in enumerate((None, sigmas, false)):
+        scans = Scans(points, poses, sigmas=own)
+        city = tiles_of(scans, tmp_path / str(i), tile_size=102.4)
+        assert city.clutter_ratio == radarsdf.fit(scans, config=CONFIG, progress=False).clutter_ratio
+        off_m.append(distance_from_wall_m(city.mesh()))
+        assert len(city.tiles) > 1
+        assert ("deviations stated by the sensor" in caplog.text) is (own is false)
+    assert off_m[1] < 0.8 * off_m[0]
+    assert off_m[2] == off_m[0]
 
 
 def test_one_tile_equals_one_fit(drive, tmp_path):

@@ -35,8 +35,10 @@ class Surfels:
     widest: Floats32 | None = None  # (P, 3) axes of the largest variance, unit vectors, in a batch
 
     @classmethod
-    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> "Surfels":
-        return cls.of_sums(ScanSums.of(rays, leaf_size_m, num_threads), num_threads)
+    def of(
+        cls, rays: Rays, leaf_size_m: float, num_threads: int = 0, weights: Ints32 | None = None
+    ) -> "Surfels":
+        return cls.of_sums(ScanSums.of(rays, leaf_size_m, num_threads, weights=weights), num_threads)
 
     @classmethod
     def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> "Surfels":

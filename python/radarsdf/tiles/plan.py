@@ -27,7 +27,7 @@ from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.rig import Label
 from radarsdf.settings import by_name, settings
 
-FORMAT = {"format": "radarsdf.tiles", "format_version": 4}
+FORMAT = {"format": "radarsdf.tiles", "format_version": 5}
 PLAN, TILES = "plan.json", "tiles"
 
 Tile = tuple[int, int]
@@ -120,6 +120,8 @@ class RadarPlan:
     label: int | str | None  # None: it is the only one
     sensor: Sensor  # with its noise, and its unit
     intensity_range: tuple[float, float] | None  # without outliers, its own units
+    # Medians of the deviations that it states for range, azimuth and elevation, m, rad, rad. None: it states none, or false ones
+    median_deviations: tuple[float, float, float] | None
 
 
 @settings
@@ -135,6 +137,7 @@ class Plan:
     radars: Annotated[tuple[RadarPlan, ...], Field(min_length=1)]
     scans: Annotated[_Count, Field(ge=1)]
     input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # hash of all scans
+    with_deviations: bool  # whether the files of the rays have the deviations that sensors state
     tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]  # ascending: tiles that contain a return
 
     @cached_property

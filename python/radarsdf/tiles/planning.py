@@ -7,7 +7,7 @@ import math
 import shutil
 import zlib
 from collections.abc import Iterable, Iterator
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,23 @@ from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import static_rays
-from radarsdf.returns.noise import NOISE_SETTINGS, RigNoise, SensorNoise, rig_noise, sensor_noise
+from radarsdf.returns.noise import (
+    NOISE_SETTINGS,
+    RigNoise,
+    SensorNoise,
+    credible_deviations,
+    rig_noise,
+    sensor_noise,
+)
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, rays_from
+from radarsdf.returns.rays import (
+    LeftOut,
+    Rays,
+    check_range,
+    median_deviations,
+    middle_scan,
+    rays_from,
+)
 from radarsdf.returns.sensor import SAME_UNIT, Sensor, Unit, in_map_unit, intensity_units
 from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label
@@ -32,8 +46,10 @@ from radarsdf.tiles.plan import Plan, RadarPlan, Tile, TileGrid, TilePlan, folde
 
 _LOG = logging.getLogger("radarsdf.tiles")
 SCANS_FILE = "scans.npy"
-_RECORD = np.dtype([("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")])
+_RECORD = [("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")]
 """A return in the frame of its tile, m; index of its scan; its intensity, sensor units, NaN if there are none."""
+# Then, if sensors state any, its deviations of range, azimuth and elevation, m, rad, rad, NaN where unknown.
+_STATED = ("stated", "<f4", (3,))
 _CHUNK_SCANS = 256  # scans in memory at a time
 _CHUNK_RETURNS = 500_000  # returns in memory at a time: fewer scans of a dense sensor
 _CHUNK_M = 1000.0  # scans of a chunk share a local frame, in which float32 must be precise
@@ -48,7 +64,7 @@ def checked_scans(scans: Iterable[Any], digest: hashlib.blake2b) -> Iterator[Sca
         check(isinstance(scan, Scan), f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan", TypeError)
         shape = np.shape(scan.T_world_sensor)
         check(shape == (4, 4), f"scan {i} has no pose: T_world_sensor must be (4, 4), not {shape}")
-        for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
+        for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps, scan.sigma):
             digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
         digest.update(repr(scan.sensor).encode())
         rigid.append(bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
@@ -85,6 +101,12 @@ class _Returns:
         self.samples.append((zlib.crc32(np.asarray(scan.points).tobytes()), scan))
         self.samples = sorted(self.samples, key=itemgetter(0))[:_SENSOR_SCANS]
 
+    def median_deviations(self) -> tuple[float, float, float] | None:
+        stated = [np.asarray(scan.sigma) for _, scan in self.samples if scan.sigma is not None]
+        medians = median_deviations(np.concatenate(stated)) if stated else np.full(3, np.nan)
+        along, azimuth, elevation = np.nan_to_num(medians, nan=1.0).tolist()
+        return (along, azimuth, elevation) if np.isfinite(medians).any() else None
+
 
 class Planner:
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
@@ -94,6 +116,7 @@ class Planner:
         self._axes: list[Floats] = []  # (F, 7) sensor positions and z axes, world, and row of the radar
         self._radars: dict[Label, _Returns] = {}
         self._with_intensities: bool | None = None
+        self._record: np.dtype[np.void] | None = None  # of the first scans
 
     def _add(self, scans: list[Scan]) -> None:
         first = sum(map(len, self._axes))
@@ -111,6 +134,8 @@ class Planner:
         together = self._config.returns.accumulate_scans
         seen_from = [middle_scan(i, len(scans), together) for i in range(len(scans))]
         self._axes.append(np.concatenate([poses[seen_from, :3, 3], poses[:, :3, 2], radars[:, None]], axis=1))
+        if self._record is None:
+            self._record = record_of(rays.stated is not None)
         if len(rays) == 0:
             return
         if rays.intensities is not None:
@@ -131,10 +156,12 @@ class Planner:
                 self._counts[tile] = np.zeros(2, np.int64)
                 path.parent.mkdir(parents=True)
             self._counts[tile] += (owner[own] == tile).all(axis=1).sum(), len(own)
-            records = np.zeros(len(own), _RECORD)
+            records = np.zeros(len(own), self._record)
             records["point"] = points[own] - self._config.lattice.position(self._origins[tile])
             records["scan"] = rays.scans[own] + first
             records["intensity"] = np.nan if rays.intensities is None else rays.intensities[own]
+            if "stated" in (self._record.names or ()):
+                records["stated"] = np.nan if rays.stated is None else rays.stated[own]
             with path.open("ab") as file:
                 file.write(records.data)
 
@@ -144,7 +171,7 @@ class Planner:
         where = f"of the {len(scans)} scans from number {first} on, numbered from 0"
         with restating(where, ValueError, TypeError):
             given = held.points, held.poses, held.intensities, held.doppler_mps, held.rig
-            return static_rays(*given, self._config, whole=False)[0]
+            return static_rays(*given, self._config, held.sigmas, whole=False)[0]
 
     def plan(self, scans: Iterable[Scan], digest: hashlib.blake2b) -> Plan:
         """Read scans once, write the rays of each tile, and return the plan. `digest`: of the scans, after they are read."""
@@ -166,6 +193,7 @@ class Planner:
                 label=label if label is None or isinstance(label, (int, str)) else str(label),
                 sensor=self._sensor([(own, SAME_UNIT)]),
                 intensity_range=self._intensity_range(own, tiles, axes[:, 6] == i),
+                median_deviations=own.median_deviations(),
             )
             for i, (label, own) in enumerate(self._radars.items())
         ]
@@ -179,6 +207,7 @@ class Planner:
             radars=tuple(radars),
             scans=len(axes),
             input_digest=digest.hexdigest(),
+            with_deviations=self._record == record_of(True),
             tiles=tuple(tiles),
         )
         plan = self._completed(draft)
@@ -195,7 +224,7 @@ class Planner:
         if not plausible.holds(np.array([low, high])).all():
             low, high = math.inf, -math.inf
             for tile in tiles:
-                rows = np.fromfile(rays_path(self._folder, tile.tile), _RECORD)
+                rows = np.fromfile(rays_path(self._folder, tile.tile), self._record)
                 values = rows["intensity"][of_scans[rows["scan"]]]
                 values = values[plausible.holds(values)]
                 low, high = float(values.min(initial=low)), float(values.max(initial=high))
@@ -206,6 +235,7 @@ class Planner:
         num_threads, noises = plan.config.num_threads, list[SensorNoise]()
         units: list[tuple[Unit | None, ...]] = []
         tiles, clutter, returns, cells, in_cells = [], 0.0, 0, 0, 0.0
+        plan = self._without_false_deviations(plan)
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns):
             rays, inside = read_rays(self._folder, plan, tile)
             cost = estimate_rays(rays, plan.config, inside)
@@ -217,6 +247,8 @@ class Planner:
             noise_of = rig_noise if plan.sensors else sensor_noise
             noises.append(noise_of(surfels, rays, plan.config.returns, num_threads))
             units.append(intensity_units(surfels, rays, num_threads) if plan.sensors else (SAME_UNIT,))
+            if (weights := noises[-1].weights(rays)) is not None:
+                surfels = Surfels.of(rays, plan.config.leaf_size_m, num_threads, weights)
             clutter += surfels.clutter_ratio() * len(rays)
             returns += len(rays)
             # Of the cells beyond, the tile has only the returns whose rays cross it.
@@ -246,6 +278,16 @@ class Planner:
             returns_per_cell=in_cells / max(cells, 1),
         )
 
+    def _without_false_deviations(self, plan: Plan) -> Plan:
+        if not plan.with_deviations:
+            return plan
+        rays, _ = read_rays(self._folder, plan, max(plan.tiles, key=attrgetter("returns")))
+        settings = plan.config.leaf_size_m, plan.config.returns, plan.config.num_threads
+        credible = credible_deviations(rays, *settings)
+        false = [dataclasses.replace(radar, median_deviations=None) for radar in plan.radars]
+        each = zip(credible, plan.radars, false, strict=True)
+        return dataclasses.replace(plan, radars=tuple(own if told else other for told, own, other in each))
+
     def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
         """Estimate a sensor without noise from the samples of radars, with the intensities in one unit."""
         scans = [(scan, unit) for own, unit in radars for _, scan in own.samples]
@@ -255,16 +297,20 @@ class Planner:
         return Sensor.of([scan.points for scan, _ in scans], values or None, **limits)
 
 
+def record_of(with_deviations: bool) -> np.dtype[np.void]:
+    return np.dtype([*_RECORD, _STATED] if with_deviations else _RECORD)
+
+
 def rays_path(folder: Path, tile: Tile) -> Path:
     return folder_of(folder, tile) / "rays.bin"
 
 
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     """Rays that cross a tile, in the frame of its map, with intensities in one unit; and the mask (N,) of returns in it or its halo."""
-    path = rays_path(folder, tile.tile)
-    whole = path.exists() and path.stat().st_size == tile.rays * _RECORD.itemsize
+    path, record = rays_path(folder, tile.tile), record_of(plan.with_deviations)
+    whole = path.exists() and path.stat().st_size == tile.rays * record.itemsize
     check(whole, f"{path} does not hold the {tile.rays} rays of the plan: plan again in a new folder")
-    rows = np.fromfile(path, _RECORD)
+    rows = np.fromfile(path, record)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
     of_scans = np.array(array_in(folder / SCANS_FILE)[numbers])  # a memory map, of which few rows are read
     points = np.ascontiguousarray(rows["point"])
@@ -274,6 +320,9 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     if plan.sensors:
         radar_of_scan = of_scans[:, 6].astype(np.int32)
         rays = dataclasses.replace(rays, sensor_of_scan=radar_of_scan, num_sensors=len(plan.radars))
+    if any(radar.median_deviations for radar in plan.radars):
+        medians = [np.array(radar.median_deviations, np.float64) for radar in plan.radars]  # NaN for None
+        rays = dataclasses.replace(rays, stated=rows["stated"]).with_relative_deviations(medians)
     if plan.intensity_range is not None:
         values = np.full(len(rows), np.nan, np.float32)
         for radar, own in zip(plan.radars, rays.rows_of_sensors(), strict=True):
