@@ -87,7 +87,8 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     fits = not numbers.size or numbers.dtype.kind in "iu"
     check(fits, "frames must be a number of scans or integer frame numbers")
     numbers = np.unique(numbers)
-    check(min(every, numbers.size) >= 2, f"every {every}th of {numbers.size} scans leaves none to train on")
+    what = f"every {every}th of {numbers.size} scans"
+    check(min(every, numbers.size) >= 2, f"cannot hold out {what}: at least one must remain to train on")
     held_out = np.arange(numbers.size) % every == 0
     return numbers[~held_out].astype(np.int64), numbers[held_out].astype(np.int64)
 

@@ -204,7 +204,9 @@ def subdivided(cells: Array, parts: int) -> Array:
 
 def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config: FitConfig) -> None:
     within = max(cells, 1) * (parts + 1) ** 3 <= _MAX_VOXELS  # so that coordinates are int32, too
-    check(within, f"voxels of {voxel_size} m are too many for {cells} leaf cells: use larger ones")
+    check(
+        within, f"voxels of {voxel_size} m are too many for cells of {config.leaf_size_m} m: use larger ones"
+    )
     needed = cells * (parts if even else parts + 1) ** 3 * _MEMORY_PER_VOXEL
     check_memory(f"voxels of {voxel_size} m", needed, config.max_memory_bytes, "use larger ones")
 
