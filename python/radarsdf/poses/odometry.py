@@ -184,7 +184,7 @@ def _compare(checked: CheckedScans, config: FitConfig) -> tuple[CheckedScans, Co
     scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
     checked = replace(checked, scans=scans)
     drive = Drive(scans, checked.times_s, checked.velocities, yaws=checked.yaws)
-    tested = Consistency.of_returns(drive, config)
+    tested = next(filter(None, Consistency.of_returns(drive, config)))
     return tested.corrected(checked), tested
 
 
