@@ -9,6 +9,7 @@ import radarsdf
 from radarsdf import FitConfig, LiveMap
 from radarsdf.interrupts import at_once
 from radarsdf.live.sums import RadarSums
+from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.rigid import aligned
 from radarsdf.poses.search import Lost
 from radarsdf.returns.evidence import BLOCK_BITS
@@ -107,6 +108,32 @@ def test_a_slow_rig_is_tracked_from_the_start():
     placed = aligned(np.stack([live.pose(i) for i in ids]), scans.poses[ids])
     assert len(ids) > 45
     assert np.linalg.norm((placed - scans.poses[ids])[:, :3, 3], axis=1).max() < 0.05
+
+
+def test_comparisons_of_doppler_are_spread_over_scans(monkeypatch):
+    """They took 60 to 100 ms of a single scan."""
+    scans, steps = three_at_20_hz(KINDS["yard"](seed=0), 15, 0.017), []
+    compare = Consistency.in_steps
+
+    def recorded(*given):
+        for found in compare(*given):
+            steps.append(found)
+            yield found
+
+    monkeypatch.setattr(Consistency, "in_steps", recorded)
+    live = LiveMap(T_body_sensor=scans.T_body_sensor)
+    for i in range(44):
+        count = len(steps)
+        notes = integrate(live, scans, i).notes
+        assert len(steps) <= count + 1
+    assert any(steps)
+    assert {note.split(":")[0] for note in notes} == set(scans.sensors)
+    checks = live._follower._checks.values()
+    before = {check.under_way for check in checks} - {None}
+    integrate(live, scans, 44, live.pose(43))
+    integrate(live, scans, 45)
+    assert before.isdisjoint(check.under_way for check in checks)  # a given pose ends them
+    assert before
 
 
 def test_each_scan_needs_the_label_of_its_radar(scans):

@@ -2,8 +2,10 @@
 
 import contextlib
 import dataclasses
+import itertools
 import operator
-from collections import defaultdict, deque
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -38,7 +40,8 @@ _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 _LEAST_AGREEING = 0.1
 _COMPARED = 24  # last scans whose Doppler is compared with the returns
 # A comparison of half of them leaves scales open that place scans 5 % of the path off.
-_NOT_COMPARED = f"Assumed: the Doppler is right; the returns decide once {2 * _START} scans moved."
+_NOT_COMPARED = "Assumed: the Doppler is right; its comparison with the returns is not complete."
+_STEPS_AT_ONCE = 1  # of a comparison at a scan of a rig, about 2 ms
 _PARTED = 3  # last scans that suggest this by agreeing less than those before
 _PULLED = 0.1  # relative difference of the motion by returns and by Doppler that suggests it
 _LEAST_GAIN, _LEAST_STEP_M = 1e-5, 0.1  # of a step whose difference is known
@@ -80,8 +83,8 @@ class Step:
     @property
     def scan(self) -> Floats:
         """(N, 3) static returns, frame of the poses, m."""
-        rig = _rig_of([self])
-        return self.sensor_scan if rig is None else rig.in_body([self.sensor_scan])[0]
+        radar, scan = self.logged.radar, self.sensor_scan
+        return scan if radar is None else scan @ radar.T_body_sensor[:3, :3].T + radar.T_body_sensor[:3, 3]
 
     @cached_property
     def moves(self) -> bool:
@@ -110,24 +113,37 @@ class Track:
 class _DopplerCheck:
     """Comparison of the Doppler of a radar with its returns."""
 
+    label: Label | None
     time_s: float = -np.inf  # of the last scan compared
     patience: int = _START // 2  # scans until the next comparison
     compared: int = 0  # scans
     doubts: tuple[str, ...] = ()
+    refused: bool = False  # whether the returns excluded the Doppler: the next scans are compared at once
+    under_way: Iterator[tuple[Floats, SensorVelocities, Consistency] | None] | None = None
 
-    def update(self, steps: list[Step], config: FitConfig) -> None:
-        """Compare the last scans of the radar, if due. Raise Lost if their returns exclude the Doppler."""
+    def begin(self, steps: list[Step], config: FitConfig) -> None:
+        """Begin to compare the last scans of the radar, if due."""
         without = [i for i, step in enumerate(steps) if step.velocity is None or step.given]
         steps = steps[max(without, default=-1) + 1 :][-_COMPARED:]
         count, since = len(steps), sum(step.time_s > self.time_s for step in steps)
-        due = count in (_START, 2 * _START)
-        if count < _START or not (due or (since >= self.patience and self._suspects(steps))):
+        due = self.refused or count == _START or count >= 2 * _START > self.compared
+        if self.under_way or count < _START:
+            return
+        if not due and (since < self.patience or not self._suspects(steps)):
             return
         # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
         self.time_s, self.patience = steps[-1].time_s, self.patience * (1 if due else 2)
-        with contextlib.suppress(NoVelocityError):
-            self.doubts = self._compare(_drive_of(steps), config)
-            self.compared = count
+        self.under_way = _compare(steps, config)
+
+    def proceed(self, most: int | None) -> None:
+        """Continue the comparison by `most` steps. Raise Lost if the returns exclude the Doppler."""
+        # If this is interrupted, so is the comparison.
+        under_way, self.under_way = self.under_way, None
+        for found in filter(None, itertools.islice(under_way or (), most)):
+            self._decide(*found)
+            break
+        else:
+            self.under_way = under_way
 
     def _suspects(self, steps: list[Step]) -> bool:
         pulls = np.array([step.pull for step in steps if np.isfinite(step.pull)])[-_START:]
@@ -136,19 +152,19 @@ class _DopplerCheck:
         parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
         return bool(pulled or parted or self.doubts or not self.compared)
 
-    def _compare(self, drive: Drive, config: FitConfig) -> tuple[str, ...]:
-        velocities, begin = drive.velocities, f"Scan 0 of these is that at {drive.times_s[0]:.6f} s."
-        assert velocities is not None
-        tested = Consistency.of_returns(drive, config)
+    def _decide(self, times_s: Floats, velocities: SensorVelocities, tested: Consistency) -> None:
+        of = "" if self.label is None else f" of {self.label}"
+        begin = f"Scan 0 of these is that{of} at {times_s[0]:.6f} s."
         other = tested.contradicted if velocities.offset is None else None
-        if other is not None and not other.confirmed:
-            return (f"Assumed: the Doppler is right; {other.words('the returns')}. {begin}",)
         trusted, notes = tested.applied(velocities)
-        if trusted is None:
-            self.time_s = -np.inf  # the next scans are compared, too
+        if other is not None and not other.confirmed:
+            notes = [f"Assumed: the Doppler is right; {other.words('the returns')}."]
+        elif trusted is None:
+            self.refused = True
             msg = f"{notes[-1]} {begin} Give the poses of this scan and the next ones, or leave their Doppler out"
             raise Lost(msg)
-        return tuple(f"{note} {begin}" for note in notes)
+        self.refused, self.compared = False, len(times_s)
+        self.doubts = tuple(f"{note} {begin}" for note in notes)
 
 
 class Follower:
@@ -156,7 +172,7 @@ class Follower:
 
     def __init__(self, config: FitConfig, num_radars: int) -> None:
         self.config, self.num_radars = config, num_radars
-        self._checks: defaultdict[Label | None, _DopplerCheck] = defaultdict(_DopplerCheck)  # by radar
+        self._checks: dict[Label | None, _DopplerCheck] = {}  # by radar
         self._edits = 0  # of the log, when the poses were read
         self._complete = False  # False while the attributes below change, or if that was interrupted
         self._steps: deque[Step] = deque(maxlen=_STEPS * num_radars)
@@ -179,7 +195,12 @@ class Follower:
         found = self._start(log, new, sign) or [self._next(new, sign)]
         self._refuse_unobserved(new, found)
         self._refuse_leap(new)
-        self._checks[new.logged.label].update(self._of_radar(found[-1]), self.config)
+        own = self._checks.setdefault(new.logged.label, _DopplerCheck(new.logged.label))
+        own.begin(self._of_radar(found[-1]), self.config)
+        # Scans of a rig follow each other closely: a comparison is spread over the next ones of all radars.
+        waiting = [check for check in self._checks.values() if check.under_way]
+        first = own if own.refused else min(waiting, key=operator.attrgetter("time_s"), default=own)
+        first.proceed(None if first.refused or self.num_radars == 1 else _STEPS_AT_ONCE)
         return found
 
     def _refuse_unobserved(self, new: Step, found: list[Step]) -> None:
@@ -218,8 +239,9 @@ class Follower:
         used = [step, *reversed(self._steps)][: 3 * self.num_radars - 2]
         notes = list[str]()
         for label in dict.fromkeys(one.logged.label for one in used if one.velocity and not one.given):
-            check = self._checks[label]
-            doubts = check.doubts or ((_NOT_COMPARED,) if check.compared < 2 * _START else ())
+            check = self._checks.get(label, _DopplerCheck(label))
+            known = check.compared >= 2 * _START and not check.under_way and not check.refused
+            doubts = check.doubts or (() if known else (_NOT_COMPARED,))
             notes += [note if label is None else f"{label}: {note}" for note in doubts]
         return tuple(notes)
 
@@ -242,6 +264,9 @@ class Follower:
         if new is None:  # reset to the state after only these scans
             self._steps.clear()
             new = len(steps)
+        if not self._steps or track.given:  # comparisons under way may be of other scans
+            for check in self._checks.values():
+                check.under_way = None
         for i in range(len(steps) - new, len(steps)):
             self._add(steps[i], planes=i >= len(steps) - WINDOW * self.num_radars)
         for scan_id, logged in track.given:
@@ -298,16 +323,16 @@ class Follower:
         # Short steps of a rig follow the prior: without their errors, it would shrink to nothing.
         turns = TURNS.learnt([rates.turn for rates in known], durations_s, with_errors=self.num_radars > 1)
         moves = MOVES.learnt([rates.move for rates in known], durations_s)
-        scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
-        drive = Drive(scans, times_s, self._velocities(steps, sign), turns, moves, rig=_rig_of(steps))
+        scan, times_s = new.scan, np.array([step.time_s for step in steps])
+        drive = Drive([], times_s, self._velocities(steps, sign), turns, moves, rig=_rig_of(steps))
         expected = drive.predict(len(steps) - 1, steps[-2].rates)
-        found = self._tracker.register(drive.scans[-1], expected)
+        found = self._tracker.register(scan, expected)
         if drive.rig is None and drive.velocities is not None and sign and not found.agreeing > 0:
             # A sensor that turns faster than predicted was dead-reckoned, or lost.
-            _, yaws = sign_significance(drive.scans, drive.velocities, drive.times_s)
+            _, yaws = sign_significance([step.scan for step in steps], drive.velocities, times_s)
             searched = dataclasses.replace(drive, yaws=yaws, turns=TURNS)
             expected = searched.predict(len(steps) - 1, steps[-2].rates)
-            found = self._tracker.register(drive.scans[-1], expected)
+            found = self._tracker.register(scan, expected)
         unknown = drive.velocities is None or found.segment > 0
         pull = np.nan if unknown else _pull(steps[-2].found, found, expected)
         return dataclasses.replace(new, found=found, pull=pull, sign=sign)
@@ -344,7 +369,8 @@ class Follower:
         moving = [i for i in range(first, len(steps)) if steps[i].moves]
         most = _START * self.num_radars
         first = max([first, len(steps) - most, *(i - 1 for i in moving[:1])])
-        count, sign_open = len(moving), sign == 0 and new.velocity is not None
+        count, alone = len(moving), len(self._of_radar(new)) == 1  # its only scan tells no sign
+        sign_open = sign == 0 and new.velocity is not None and not alone
         due = count & (count - 1) == 0 and (sign_open or (first < _KNOWN_STEPS and count <= most))
         due = due or (sign_open and count <= most)
         if not new.moves or not due:
@@ -373,13 +399,14 @@ class Follower:
             if len(speeds) == len(own) > 1:
                 with contextlib.suppress(NoVelocityError):
                     found = SensorVelocities.of([step.logged.points for step in own], speeds, times_s[rows])
-                    seen = [step.sensor_scan for step in own]
-                    gain, turned = sign_significance(seen, found.scaled(sign or 1.0), times_s[rows])
                     measured.append((rows, found))
-                    gains.append(gain)
-                    yaws = turned if rig is None else yaws
+                    if rig is None or sign == 0:
+                        seen = [step.sensor_scan for step in own]
+                        gain, turned = sign_significance(seen, found.scaled(sign or 1.0), times_s[rows])
+                        gains.append(gain)
+                        yaws = turned if rig is None else yaws
         if measured:
-            evidence = sum(gains) / np.sqrt(len(gains))
+            evidence = sum(gains) / np.sqrt(max(len(gains), 1))
             # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Where returns do not show
             # it, as in a tunnel, that of odometry is assumed: each comparison with the returns then states the doubt.
             if abs(evidence) <= CLEAR and len(steps) == _START * self.num_radars:
@@ -400,11 +427,14 @@ def _rig_of(steps: list[Step]) -> Rig | None:
     return Rig.of([radar.label for radar in known], dict(known)) if known else None
 
 
-def _drive_of(steps: list[Step]) -> Drive:
-    """Return scans of one radar with its Doppler, for a comparison. Raise a NoVelocityError if that yields no velocities."""
+def _compare(
+    steps: list[Step], config: FitConfig
+) -> Iterator[tuple[Floats, SensorVelocities, Consistency] | None]:
+    """Compare the Doppler of scans of a radar with their returns; yield None after each step, and times, velocities, and result."""
     times_s, scans = np.array([step.time_s for step in steps]), [step.sensor_scan for step in steps]
-    points, speeds = zip(*((step.logged.points, step.logged.doppler_mps) for step in steps), strict=True)
-    velocities = SensorVelocities.of(points, speeds, times_s).scaled(steps[-1].sign or 1.0)
+    known = ((step.logged.points, step.logged.doppler_mps, step.velocity) for step in steps)
+    points, speeds, each = zip(*known, strict=True)
+    velocities = SensorVelocities.of(points, speeds, times_s, each).scaled(steps[-1].sign or 1.0)
     fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
     yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
     inertial = Inertial()
@@ -413,7 +443,10 @@ def _drive_of(steps: list[Step]) -> Drive:
         turns = step_vectors(np.stack([step.found.pose @ radar.T_body_sensor for step in steps]))[:, 3:]
         unbiased = MotionRate(np.zeros(3), FIRST_BIAS_RAD_S**2 * np.eye(3))
         inertial = Inertial(Gyroscope(turns, np.diff(times_s), unbiased))
-    return Drive(scans, times_s, velocities, yaws=yaws, inertial=inertial)
+    yield None
+    drive = Drive(scans, times_s, velocities, yaws=yaws, inertial=inertial)
+    for tested in Consistency.in_steps(drive, config):
+        yield None if tested is None else (times_s, velocities, tested)
 
 
 def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:

@@ -9,7 +9,7 @@ from scipy.stats import t as student
 
 from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.agreement import ERRORS, LEAST_M, Gain, of_neighbours
+from radarsdf.poses.agreement import ERRORS, LEAST_M, Agreement, Gain, of_neighbours
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import (
     BY_CHANCE,
@@ -20,7 +20,7 @@ from radarsdf.poses.doppler import (
     slope_of,
     windows_of,
 )
-from radarsdf.poses.planes import plane_cell_m
+from radarsdf.poses.planes import Tracked, plane_cell_m
 from radarsdf.poses.rigid import assembled, rotation, steps
 from radarsdf.poses.tracking import Drive, Tracker, track_once
 
@@ -226,9 +226,15 @@ class Consistency:
     @classmethod
     def of_returns(cls, drive: Drive, config: FitConfig) -> "Consistency":
         """Compare scans, tracked with velocities that are hardly known; without enough of them, nothing is known."""
+        return next(filter(None, cls.in_steps(drive, config)))
+
+    @classmethod
+    def in_steps(cls, drive: Drive, config: FitConfig) -> Iterator["Consistency | None"]:
+        """Yield None after each step of :meth:`of_returns`, of a few milliseconds, and the result after the last."""
         durations_s, velocities = np.diff(drive.times_s), drive.velocities
         if velocities is None or len(durations_s) < FEWEST_STEPS:
-            return cls()
+            yield cls()
+            return
         lengths_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * durations_s
         most_apart = max(len(lengths_m) // (2 * FEWEST_STEPS), 1)
         every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, most_apart))
@@ -239,16 +245,20 @@ class Consistency:
         free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config)
         sampled = drive if every == 1 else Drive(scans, times_s, None)  # turns are known between neighbours
-        tracked, _ = track_once(replace(sampled, velocities=free), tracker)
+        tracked, apart, agreement = list[Tracked](), list[Floats](), of_neighbours(scans, _SAMPLED)
+        for step, _ in track_once(replace(sampled, velocities=free), tracker):
+            tracked.append(step)
+            yield None
         filled = np.array([len(scan) > 0 for scan in scans])
         usable = (np.diff(runs_of(times_s)) == 0) & filled[1:] & filled[:-1]
         if usable.sum() < FEWEST_STEPS:
-            return cls()
-        followed = usable & (np.diff([found.segment for found in tracked]) == 0)
-        poses = np.stack([found.pose for found in tracked])
+            yield cls()
+            return
+        followed = usable & (np.diff([step.segment for step in tracked]) == 0)
+        poses = np.stack([step.pose for step in tracked])
         motion = DopplerMotion.by(compared, times_s, poses)
         own, shown, axes = motion.steps[:, :3, 3], steps(poses)[:, :3, 3], poses[:-1, :3, :3]
-        in_world = np.stack([found.covariance[:3, :3] for found in tracked[1:]])
+        in_world = np.stack([step.covariance[:3, :3] for step in tracked[1:]])
         covariance = np.einsum("fji,fjk,fkl->fil", axes, in_world, axes)  # of `shown`, m²
         # Differences relative to the Doppler, without the share of the prior. NaN where returns hardly observe them.
         before = free.step_covariances(motion.durations_s)
@@ -258,8 +268,10 @@ class Consistency:
         along = np.where(followed & (seen > _LEAST_SEEN), along / np.maximum(seen, _LEAST_SEEN), np.nan)
         rows_of_pairs = np.flatnonzero(usable)  # also where tracking was lost: by wrong Doppler, it may be
         rows_of_pairs = rows_of_pairs[:: -(-len(rows_of_pairs) // _PAIRS)]
-        reversed_yaws = None if sampled.yaws is None else sampled.yaws[1]
-        pairs = _Pairs.of(scans, motion, along, rows_of_pairs, reversed_yaws)
+        for i in rows_of_pairs.tolist():
+            apart.append(_distances(agreement, motion, i, sampled.yaws))
+            yield None
+        pairs = _Pairs.of(np.stack(apart), along[rows_of_pairs])
         delay, possible = 0, tuple[int, ...]()
         if every <= MOST_LATE:
             # The fastest steps: of slow ones, errors of the returns seem delays.
@@ -272,8 +284,8 @@ class Consistency:
         shown = own * (1 + np.nan_to_num(along)[:, None])
         clock = Clock.of(times_s, shown, own, np.isfinite(along)) if every == 1 else None
         found, doubts = _judged(pairs, rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)])
-        known = found is not None or (~pairs.slow).sum() >= FEWEST_STEPS
-        return cls(delay, possible, found, clock, doubts if known else None)
+        known = found or (~pairs.slow).sum() >= FEWEST_STEPS
+        yield cls(delay, possible, found, clock, doubts if known else None)
 
     def widened(self, rows: Ints, poses: Floats, covariance: Floats, segments: Ints, drive: Drive) -> Floats:
         """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt.
@@ -351,28 +363,11 @@ class _Pairs:
     slow: Bools  # (K,) whether there is no motion by Doppler
 
     @classmethod
-    def of(
-        cls, scans: list[Floats], motion: DopplerMotion, along: Floats, rows: Ints, yaws: Floats | None
-    ) -> "_Pairs":
-        """Compare the returns of scans `rows` (K,) with those of the next ones, at the rotations of tracked poses.
-
-        `yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
-        """
-        scales, agreement = len(_SCALES), of_neighbours(scans, _SAMPLED)
-        slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
-        apart = np.full((len(rows), 2 * scales + 1 + len(_SHIFTS_M)), np.nan)
-        for i, own, still in zip(rows.tolist(), apart, slow.tolist(), strict=True):
-            step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
-            # A pair without motion by Doppler decides no scale, and others need no shifts.
-            tried = slice(2 * scales, None) if still else slice(2 * scales + 1)
-            shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])[tried]
-            turns = [motion.steps[i, :3, :3]]
-            if yaws is not None and np.isfinite(yaws[i]):
-                turns.append(rotation(np.array([0.0, 0.0, yaws[i]])))
-            both = [assembled(np.tile(turn, (len(shifts_m), 1, 1)), shifts_m) for turn in turns]
-            own[tried] = np.min([agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both], axis=0)
-        ahead, back, unmoved, shifted = np.split(apart, np.cumsum([scales, scales, 1]), axis=1)
-        return cls(back - ahead, shifted - unmoved, unmoved[:, 0] - ahead[:, _SAME], along[rows], slow)
+    def of(cls, apart: Floats, along: Floats) -> "_Pairs":
+        """Build from the distances (K, H) that :func:`_distances` yields for K pairs, and `along` (K,)."""
+        ahead, back, unmoved, shifted = np.split(apart, np.cumsum([len(_SCALES), len(_SCALES), 1]), axis=1)
+        moved = unmoved[:, 0] - ahead[:, _SAME]
+        return cls(back - ahead, shifted - unmoved, moved, along, np.isnan(moved))
 
     def select(self, rows: slice | Bools) -> "_Pairs":
         return _Pairs(*(column[rows] for column in vars(self).values()))
@@ -415,6 +410,25 @@ class _Pairs:
         possible = _SCALES[Gain.of_samples(own[:, None] - self.gains).excess(BY_CHANCE) <= 1]
         share, limit = self.tracked(BY_CHANCE)
         return 1 + min(float(np.abs(possible - 1).max(initial=0)), abs(share) + limit)
+
+
+def _distances(agreement: Agreement, motion: DopplerMotion, i: int, yaws: Floats | None) -> Floats:
+    """Compare the returns of scan `i` with those of the next one, after motions with tracked rotations: mean log distances (H,).
+
+    `yaws` (2, F - 1): as :attr:`Drive.yaws`. With the second ones, returns agree best after the reverse of the steps.
+    """
+    scales, step = len(_SCALES), motion.steps[i]
+    apart, step_m = np.full(2 * scales + 1 + len(_SHIFTS_M), np.nan), np.multiply.outer(_SCALES, step[:3, 3])
+    # A pair without motion by Doppler decides no scale, and others need no shifts.
+    slow = np.linalg.norm(motion.velocities.mean_mps[i]) < _STILL_MPS
+    tried = slice(2 * scales, None) if slow else slice(2 * scales + 1)
+    shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])[tried]
+    turns = [step[:3, :3]]
+    if yaws is not None and np.isfinite(yaws[1, i]):
+        turns.append(rotation(np.array([0.0, 0.0, yaws[1, i]])))
+    both = [assembled(np.tile(turn, (len(shifts_m), 1, 1)), shifts_m) for turn in turns]
+    apart[tried] = np.min([agreement.log_distances(i + 1, i, T).mean(axis=1) for T in both], axis=0)
+    return apart
 
 
 def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[OtherMotion, ...]]:

@@ -34,6 +34,7 @@ BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a d
 FEWEST_STEPS = 6  # of a window
 # Objects that move slower may pass as static: of those near a hand-held radar, 13 scans in succession had an offset of 0.1 m/s.
 _PASSING_MPS = 0.15
+_Velocities = Sequence[SensorVelocity]
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
 
 
@@ -53,14 +54,16 @@ class SensorVelocities:
     common_sigma: float = _IN_COMMON
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
-    of_scans: Sequence[SensorVelocity] = ()  # F estimates of each scan alone
+    of_scans: _Velocities = ()  # F estimates of each scan alone
     # Significant constant in the Doppler of all returns as given, m/s, from scan to scan.
     offset: tuple[float, int, int] | None = None
 
     @classmethod
-    def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> "SensorVelocities":
-        """Estimate from scans (N_i, 3), sensor frame, m. Raise a NoVelocityError if less than half, or two, yield a velocity."""
-        each = sensor_velocities(scans, doppler_mps)
+    def of(
+        cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats, each: _Velocities = ()
+    ) -> "SensorVelocities":
+        """Estimate from scans (N_i, 3), sensor frame, m, or those of `each`. Raise a NoVelocityError if less than half, or two, have one."""
+        each = each or sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
         if 2 * found.sum() < max(len(found), 2):
             needed = f"at least {MIN_DOPPLER_RETURNS} returns with Doppler in m/s, of which 40 % agree"
@@ -134,7 +137,7 @@ def slope_of(x: Floats, y: Floats) -> tuple[float, float, Floats]:
 
 
 def _offset(
-    each: list[SensorVelocity], scans: Sequence[Floats], doppler: Sequence[Array]
+    each: _Velocities, scans: Sequence[Floats], doppler: Sequence[Array]
 ) -> tuple[float, int, int] | None:
     """Return a significant constant in the Doppler of static returns, which in all directions is no velocity."""
     found = list[tuple[float, ...]]()

@@ -1,6 +1,7 @@
 """Drives without poses: prediction of each step, registration with the previous scans, and passes that learn the motion prior."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -272,7 +273,8 @@ def track_drive(
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
-        tracked, rates = track_once(drive, Tracker(cell_m, config, drive.window))
+        found = [*track_once(drive, Tracker(cell_m, config, drive.window))]
+        tracked, rates = [step for step, _ in found], [rates for _, rates in found[1:]]
         turn_rates, move_rates = [step.turn for step in rates], [step.move for step in rates]
         turns, moves = drive.turns, drive.moves
         if i == 0 and drive.usual_turn_rad_s < SLOW_TURN_RAD_S and tracked[-1].segment > 0:
@@ -292,26 +294,21 @@ def track_drive(
     return drive, tracked
 
 
-def track_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]]:
-    """Track all scans in one pass; return them, and the rates of each step."""
-    tracked: list[Tracked] = []
-    rates: list[Rates] = []
-    last = Rates(drive.first_turn)
+def track_once(drive: Drive, tracker: Tracker) -> Iterator[tuple[Tracked, Rates]]:
+    """Track all scans in one pass: yield each, and the rates of the step to it; of the first one, the known ones."""
+    now, last = Tracked(np.eye(4)), Rates(drive.first_turn)
     for i, scan in enumerate(drive.scans):
-        predicted = drive.predict(i, last) if i else None
-        now = Tracked(np.eye(4)) if predicted is None else tracker.register(scan, predicted)
-        tracker.add(scan, now)
-        if predicted is not None:
-            before, duration_s = tracked[-1], predicted.duration_s
+        if i:
+            before, predicted = now, drive.predict(i, last)
+            now = tracker.register(scan, predicted)
             if now.segment != before.segment:
                 last = Rates()
-            elif duration_s > 0:
-                last = rates_of(before.pose, now, duration_s)
+            elif predicted.duration_s > 0:
+                last = rates_of(before.pose, now, predicted.duration_s)
             else:  # two radars measured at once
                 last = last._replace(duration_s=0.0)
-            rates.append(last)
-        tracked.append(now)
-    return tracked, rates
+        tracker.add(scan, now)
+        yield now, last
 
 
 def rates_of(before: Floats, now: Tracked, duration_s: float) -> Rates:
