@@ -34,7 +34,8 @@ from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.rig import Label, Rig
 
 _STEPS = 100  # steps from which the motion prior is learnt
-_START = 8  # scans of the initialisation, re-estimated after 2, 4 and 8 with motion, or after each while the sign is open
+# Scans of the initialisation, re-estimated after 2, 4 and 8 with motion, and those of a single radar after each while the sign is open.
+_START = 8
 _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 # Least share of returns of a known radar that agree while the sign of the Doppler is open: a wrong one places scans metres off.
 _LEAST_AGREEING = 0.1
@@ -372,7 +373,7 @@ class Follower:
         count, alone = len(moving), len(self._of_radar(new)) == 1  # its only scan tells no sign
         sign_open = sign == 0 and new.velocity is not None and not alone
         due = count & (count - 1) == 0 and (sign_open or (first < _KNOWN_STEPS and count <= most))
-        due = due or (sign_open and count <= most)
+        due = due or (sign_open and (count == most or (count < most and self.num_radars == 1)))
         if not new.moves or not due:
             return None
         sign, tracked = self._followed(steps[first:], sign)
