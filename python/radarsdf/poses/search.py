@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from os import PathLike
 from typing import Any
 
@@ -261,18 +261,18 @@ class _Raster:
         pixels = np.floor((points[:, :2] - self.corner) / self.pixel_m).astype(np.int64)
         flat, size = np.ravel_multi_index(tuple(pixels.T), self.shape, mode="clip"), math.prod(self.shape)
         counts = np.bincount(flat, minlength=size)
-        sums = [counts > 0, *(np.bincount(flat, n, size) / np.maximum(counts, 1) for n in normals[:, :2].T)]
+        sums = [counts > 0, *(np.bincount(flat, n / counts[flat], size) for n in normals[:, :2].T)]
         return np.stack(sums).astype(np.float32).reshape(3, *self.shape)
 
 
 def _peaks(scores: Array) -> tuple[Array, Array]:
     """Return the pixels (K, 2) of the best scores of as many blocks of 4 × 4, and these scores (K,)."""
-    rows, columns = (4 * (n // 4) for n in scores.shape)
-    blocks = scores[:rows, :columns].reshape(rows // 4, 4, columns // 4, 4).swapaxes(1, 2).reshape(-1, 16)
-    best = blocks.max(axis=1)
+    rows, columns = (n // 4 for n in scores.shape)
+    blocks = scores[: 4 * rows, : 4 * columns].reshape(rows, 4, columns, 4)
+    best = reduce(np.maximum, np.moveaxis(blocks.max(axis=1), 2, 0)).ravel()
     chosen = np.argpartition(-best, min(_PEAKS, len(best)) - 1)[:_PEAKS]
-    inside = blocks[chosen].argmax(axis=1)
-    row, column = np.unravel_index(chosen, (rows // 4, columns // 4))
+    row, column = np.unravel_index(chosen, (rows, columns))
+    inside = blocks[row, :, column].reshape(-1, 16).argmax(axis=1)
     return np.column_stack([4 * row + inside // 4, 4 * column + inside % 4]), best[chosen]
 
 
@@ -315,9 +315,10 @@ def search(index: SurfaceIndex, submap: OrientedPoints, num_threads: int) -> Flo
     poses agrees by the object that it is registered to.
     """
     found = _Places.of(index, submap, num_threads)
-    if (why := found.refusal(found.best)) is not None:
+    best = int(np.argmax(found.agreeing))
+    if (why := found.refusal(best)) is not None:
         raise why
-    return found.poses_of_frame[found.best]
+    return found.poses_of_frame[best]
 
 
 def search_near(
@@ -335,7 +336,7 @@ def search_near(
             found = _Places.of(index, submap, num_threads, guess)
         except Lost:
             continue
-        k = found.best
+        k = int(np.argmax(found.agreeing))
         if k in found.elsewhere(0) and found.refusal(k) is None:
             at = found.names
             msg = f"the scans agree better with the map at {at[k]} than at the guess, {at[0]}"
@@ -397,10 +398,6 @@ class _Places:
         return np.asarray(self.scores @ on / max(int(on.sum()), 1))
 
     @property
-    def best(self) -> int:
-        return int(np.argmax(self.agreeing))
-
-    @property
     def names(self) -> list[str]:
         return [f"({x:.1f}, {y:.1f})" for x, y in self.poses[:, :2, 3] + self.index.origin[:2]]
 
@@ -432,10 +429,6 @@ class _Places:
         others = np.flatnonzero(apart_m(self.poses, self.poses[place], lever_m) > self.capture_m)
         return others[np.argsort(-self.agreeing[others])]
 
-    def points_at(self, place: int) -> Floats:
-        pose = self.poses[place]
-        return self.points @ pose[:3, :3].T + pose[:3, 3]
-
     def _log_odds(self, place: int) -> tuple[Floats, float]:
         """Return the log likelihood ratios of a place to each place (K,), and to none of them.
 
@@ -454,8 +447,8 @@ class _Places:
     def _agreeing_objects(self) -> tuple[Floats, Bools]:
         """(K, O) mean agreement of each object, and whether most of it is within the outline of the map."""
         # A map of a part of the scene says nothing about what lies around it.
-        places = range(len(self.poses))
-        within = np.stack([self.index.outlines(self.points_at(k), self.capture_m) for k in places])
+        placed = (self.points @ pose[:3, :3].T + pose[:3, 3] for pose in self.poses)
+        within = np.stack([self.index.outlines(points, self.capture_m) for points in placed])
         counts, scores = within @ self.objects, (within * self.scores) @ self.objects
         return scores / np.maximum(counts, 1), counts > 0.5 * self.objects.sum(axis=0)
 
