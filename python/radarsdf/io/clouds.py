@@ -57,26 +57,15 @@ def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
 
 
 def read_points(path: AnyPath) -> Floats:
-    """Read points, such as ground truth from a lidar, from a file of any format that :func:`read` supports.
+    """Read points, such as ground truth from a lidar, from a PCD, PLY, LAS, LAZ, ``.bin``, ``.npy`` or text file.
 
-    Parameters
-    ----------
-    path : path-like
-        A PCD, PLY, LAS, LAZ, ``.bin``, ``.npy`` or text file.
+    Raises a ValueError if the file is damaged, of another kind, or holds no points, an OSError if it cannot be read, and an
+    ImportError that names a missing library.
 
     Returns
     -------
     (M, 3) float64 ndarray
         Finite points, m, in the frame of the file; for a PCD file, the frame to which its ``VIEWPOINT`` transforms.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged, of another kind, or holds no points.
-    OSError
-        If it cannot be read.
-    ImportError
-        If it needs a library that is not installed; the message names it.
     """
     file = path_of(path, "path")
     columns = read_columns(file)
@@ -322,6 +311,9 @@ def write_cloud(path: AnyPath, scans: Scans) -> int:
     units, doppler in m/s, and time, s. Coordinates are float64. LAS and LAZ round them to 0.1 mm, and store the other columns
     as extra dimensions. PCD holds float32, since most programs read nothing else.
 
+    Raises a ValueError for another suffix, if `path` is no regular file, the scans cannot be read, or float32 is too coarse; an
+    OSError if a file cannot be read or written; an ImportError that names a missing library.
+
     Parameters
     ----------
     path : path-like
@@ -333,15 +325,6 @@ def write_cloud(path: AnyPath, scans: Scans) -> int:
     -------
     int
         Number of returns.
-
-    Raises
-    ------
-    ValueError
-        For another suffix, if `path` is no regular file, the scans cannot be read, or float32 is too coarse.
-    OSError
-        If a file cannot be read or written.
-    ImportError
-        If the format needs a library that is not installed; the message names it.
     """
     suffix = checked_suffix(path, CLOUD_OUT_SUFFIXES, "point clouds to write")
     parts = []

@@ -49,7 +49,9 @@ def holds_mesh(path: AnyPath) -> bool:
 def write_mesh(path: AnyPath, mesh: Mesh) -> None:
     """Write a mesh atomically.
 
-    PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. The root of a GLB turns y up, as glTF demands.
+    PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. The root of a GLB turns y up, as glTF demands. Raises
+    a ValueError for another suffix, if `path` is no regular file, or if float32 is too coarse: beyond 16 km from the origin;
+    an OSError if the file cannot be written.
 
     Parameters
     ----------
@@ -57,13 +59,6 @@ def write_mesh(path: AnyPath, mesh: Mesh) -> None:
         A file that ends in .ply, .obj, .off, .stl or .glb.
     mesh : trimesh.Trimesh
         World frame, m. PLY keeps scalar vertex attributes, such as confidence, and colours.
-
-    Raises
-    ------
-    ValueError
-        For another suffix, if `path` is no regular file, or if float32 is too coarse: beyond 16 km from the origin.
-    OSError
-        If it cannot be written.
     """
     suffix = checked_suffix(path, MESH_SUFFIXES, "meshes")
     if suffix in _FLOAT32_SUFFIXES:
@@ -74,24 +69,10 @@ def write_mesh(path: AnyPath, mesh: Mesh) -> None:
 
 
 def read_mesh(path: AnyPath) -> Mesh:
-    """Read a triangle mesh.
+    """Read a triangle mesh, with all its vertices, unmerged, from a file that ends in .ply, .obj, .off, .stl or .glb.
 
-    Parameters
-    ----------
-    path : path-like
-        A file that ends in .ply, .obj, .off, .stl or .glb. GLB, whose y axis is up, is rotated to z up.
-
-    Returns
-    -------
-    trimesh.Trimesh
-        The mesh with all its vertices, unmerged. A scene of several parts becomes one mesh.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged, or holds no mesh.
-    OSError
-        If it cannot be opened.
+    A scene of several parts becomes one mesh. GLB, whose y axis is up, is rotated to z up. Raises a ValueError if the file is
+    damaged or holds no mesh, an OSError if it cannot be opened.
     """
     file = path_of(path, "path")
     check_regular_file(file)

@@ -30,6 +30,8 @@ TRUTH_ARRAYS = ("lidar_points", "ground_truth")  # the first of these that a fil
 def read_scans(path: AnyPath) -> Scans:
     """Read scans with poses from an ``.npz`` file.
 
+    Raises a ValueError if the file has another format, or inconsistent arrays, an OSError if it cannot be read.
+
     Parameters
     ----------
     path : path-like
@@ -53,13 +55,6 @@ def read_scans(path: AnyPath) -> Scans:
     -------
     Scans
         One scan for each row of ``poses`` with at least one return.
-
-    Raises
-    ------
-    ValueError
-        If the file has another format, or its arrays are inconsistent.
-    OSError
-        If the file cannot be read.
     """
     check(path_of(path, "path").suffix == ".npz", f"{path} is not an .npz file of scans")
     arrays = arrays_of(path, (*_SHAPES, *_IMU))
@@ -110,23 +105,10 @@ def _check_scans(arrays: Mapping[str, Array]) -> None:
 
 
 def write_scans(path: AnyPath, scans: Scans) -> None:
-    """Write scans as an ``.npz`` file for :func:`read_scans`, atomically.
+    """Write at least one scan as an ``.npz`` file for :func:`read_scans`, atomically.
 
-    Parameters
-    ----------
-    path : path-like
-        The file. ``.npz`` is appended if it is missing.
-    scans : Scans
-        At least one scan. Attributes that are None are omitted.
-
-    Raises
-    ------
-    TypeError
-        If `scans` is not a :class:`Scans`.
-    ValueError
-        If `path` is no regular file.
-    OSError
-        If the file cannot be written.
+    ``.npz`` is appended to the path if it is missing, and attributes that are None are omitted. Raises a TypeError if `scans` is
+    not a :class:`Scans`, a ValueError if `path` is no regular file, an OSError if it cannot be written.
     """
     instance(scans, Scans, "scans")
     lists = (scans.points, scans.intensities, scans.doppler_mps, scans.sigmas)

@@ -297,6 +297,9 @@ def check_pose_times(path: AnyPath | None, times_s: ArrayLike | None) -> None:
 def write_poses(path: AnyPath, poses: ArrayLike, times_s: ArrayLike | None = None) -> None:
     """Write a trajectory atomically.
 
+    Raises a ValueError for another suffix, if poses are not rigid transforms, or times are missing, not finite or not one per
+    pose; an OSError if the file cannot be written.
+
     Parameters
     ----------
     path : path-like
@@ -306,13 +309,6 @@ def write_poses(path: AnyPath, poses: ArrayLike, times_s: ArrayLike | None = Non
         T_world_sensor, m.
     times_s : (F,) array_like, optional
         Times, s. ``.tum`` needs them; the other formats do not store them.
-
-    Raises
-    ------
-    ValueError
-        For another suffix, if poses are not rigid transforms, or times are missing, not finite or not one per pose.
-    OSError
-        If the file cannot be written.
 
     Examples
     --------
