@@ -178,17 +178,9 @@ class FitConfig:
         return cls().override(**PAPER).override(**changes)
 
     def override(self, /, **changes: Any) -> "FitConfig":
-        """Return a copy with some settings changed.
+        """Return a copy with some settings changed, by name; for a group, `changes` hold a dict of its settings, or all of it.
 
-        Parameters
-        ----------
-        **changes
-            Settings by name. For a group: a dict of the settings that change, or the whole group.
-
-        Raises
-        ------
-        ValueError
-            For an unknown setting, or a value of the wrong type or out of range.
+        Raises a ValueError for an unknown setting, or a value of the wrong type or out of range.
 
         Examples
         --------

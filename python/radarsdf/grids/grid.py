@@ -301,19 +301,10 @@ class Grid:
         return FlatGrid(self.origin[:2].copy(), self.voxel_size, state, float(np.nanmedian(height)))
 
     def save(self, path: AnyPath) -> None:
-        """Write the grid to a file. An existing one is replaced only once the new one is complete.
+        """Write the grid to a file: ``.npz``, all arrays by name, or ``.bt``, OctoMap's binary octree of occupied and free voxels.
 
-        Parameters
-        ----------
-        path : path-like
-            ``.npz``: all arrays of the grid, by name. ``.bt``: OctoMap's binary octree of occupied and free voxels.
-
-        Raises
-        ------
-        ValueError
-            For another suffix, or a ``.bt`` beyond 32,768 voxels from the world's origin, or not at a multiple of its voxels.
-        OSError
-            If the file cannot be written.
+        An existing file is replaced only once the new one is complete. Raises a ValueError for another suffix, or a ``.bt`` beyond
+        32,768 voxels from the world's origin, or not at a multiple of its voxels; an OSError if the file cannot be written.
         """
         if checked_suffix(path, (".npz", ".bt"), "grids") == ".npz":
             write_arrays(path, vars(self), compressed=True)

@@ -38,7 +38,8 @@ def save_view_picture(path: AnyPath, views: Sequence[View], measured: Sequence[A
     """Save a PNG picture of views, one row each.
 
     The columns are the measured returns, if there are any, and the predicted ones, both as range over azimuth, and the
-    range to the first surface along each beam, as elevation over azimuth.
+    range to the first surface along each beam, as elevation over azimuth. Raises an ImportError without matplotlib (the
+    extra `plot`), an OSError if the file cannot be written.
 
     Parameters
     ----------
@@ -49,13 +50,6 @@ def save_view_picture(path: AnyPath, views: Sequence[View], measured: Sequence[A
     measured : sequence of arrays, optional
         For each view, the returns measured there: (N, 3) sensor frame, m, or (N, 4) with their intensity. None
         if nothing was measured.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib is not installed. It comes with the extra `plot`.
-    OSError
-        If the file cannot be written.
     """
     scans = list(measured) or [None] * len(views)
     columns = 3 if any(scan is not None for scan in scans) else 2

@@ -106,29 +106,18 @@ def save_picture(
 ) -> None:
     """Save a PNG picture of a mesh, with a colour bar if a scalar colours it.
 
+    Raises the errors of :func:`render`, an ImportError without matplotlib (the extra `plot`), or an OSError.
+
     Parameters
     ----------
     path : path-like
         The PNG file. An existing file is replaced once the new one is complete.
-    mesh : trimesh.Trimesh
-        The surface, m, with z up.
+    mesh, width, height, viewpoint
+        As for :func:`render`.
     scalar : (V,) array_like, optional
         A value per vertex, such as its intensity, coloured from the 2nd to the 98th percentile; NaN is light grey. None: all is.
     label : str
         Text of the colour bar, with the unit.
-    width, height : int
-        Size of the picture in pixels.
-    viewpoint : (3,) array_like, optional
-        As in `render`.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib is not installed. It comes with the extra `plot`.
-    ValueError
-        As `render`, or if the shape of `scalar` is wrong.
-    OSError
-        If the file cannot be written.
     """
     dpi = 100
     figure = new_figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
