@@ -31,6 +31,9 @@ _LEAST_SHARE = 0.01  # smallest share of points in a bin
 def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, Any]:
     """Compute the errors of predicted intensities.
 
+    Raises a ValueError if the shapes differ, there is no return, or a value is not finite, since every return needs a
+    prediction; a TypeError for values that are not real numbers.
+
     Parameters
     ----------
     predicted, measured : (N,) array_like
@@ -40,13 +43,6 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
     -------
     dict of str to float
         `mae` and `medae`, mean and median absolute error in the sensor's units, and `num_returns`.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, there is no return, or a value is not finite: every return needs a prediction.
-    TypeError
-        If the values are not real numbers.
     """
     p, m = _paired(predicted, "predicted", measured, "measured")
     check(p.size, "predicted and measured must both be (N,), with at least one return")
@@ -59,6 +55,8 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
 def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     """Split scans into training and held-out ones: in ascending order, scans 0, `every`, 2 · `every`, … are held out.
 
+    Raises a ValueError if `every` is below 2, or there are fewer than two scans: no scan would be left to train on.
+
     Parameters
     ----------
     frames : int or iterable of int
@@ -70,11 +68,6 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     -------
     train, test : (A,), (B,) int64
         Scan numbers, ascending. Select returns with ``numpy.isin(frame, test)``.
-
-    Raises
-    ------
-    ValueError
-        If `every` is below 2, or there are fewer than two scans: no scan would be left to train on.
 
     Examples
     --------
@@ -97,7 +90,8 @@ class KNNIntensity:
     """Intensity from the nearest returns seen from a similar direction: the paper's baseline.
 
     The search selects the `candidates` returns nearest in space, and of these the `k` with the most similar
-    viewing direction. Their intensities are averaged with the weights 1 / ((distance + 0.1 m) · (angle + 0.1 rad)).
+    viewing direction. Their intensities are averaged with the weights 1 / ((distance + 0.1 m) · (angle + 0.1 rad)). The paper
+    specifies neither `k`, `candidates` nor the weights, and no choice suits all scenes: compare with :meth:`chosen`.
 
     Parameters
     ----------
@@ -114,10 +108,6 @@ class KNNIntensity:
     ------
     ValueError, TypeError
         If a shape is wrong, a value is not finite or out of its range, or a return lies at the sensor itself.
-
-    Notes
-    -----
-    The paper specifies neither `k`, `candidates` nor the weights, and no choice suits all scenes: compare with :meth:`chosen`.
 
     Examples
     --------
@@ -297,6 +287,9 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
 def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, Any]:
     """Compare confidences in a surface with the share of true surface.
 
+    Raises a ValueError if the shapes differ, a value is out of its range, or no point has a confidence; a TypeError for values
+    that are not real numbers.
+
     Parameters
     ----------
     confidence : (N,) array_like
@@ -314,13 +307,6 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
         - `auc`: probability that a true point has a higher confidence than a false one; 0.5 is chance. None if all
           are true or all are false.
         - `true_share`: share of true points among all.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, a confidence is not in [0, 1], `is_true` is neither 0 nor 1, or no point has a confidence.
-    TypeError
-        If the values are not real numbers.
 
     Examples
     --------

@@ -130,12 +130,6 @@ def format_metrics(metrics: Mapping[str, Any]) -> str:
     """Format the result of `surface_metrics` or `intensity_metrics` as a few aligned lines of text.
 
     Surface errors are in centimetres and ratios in percent, as in the paper's tables; intensity errors are in sensor units.
-
-    Examples
-    --------
-    >>> from radarsdf.evaluation import intensity_metrics
-    >>> print(format_metrics(intensity_metrics([60.0, 70.0], [61.0, 68.0])))
-    intensity error  mean 1.50  median 1.50  (2 returns, radarsdf-intensity-1)
     """
     if "mae" in metrics:
         count = f"({metrics['num_returns']} returns, {metrics['protocol']})"

@@ -267,6 +267,8 @@ class Grid:
     def flat(self, lower_m: float = 0.3, upper_m: float = 2.0) -> FlatGrid:
         """Project the voxels between two heights above the ground to a two-dimensional grid for ROS's map_server.
 
+        Raises a ValueError if the heights are not ascending, or no column of the grid shows ground.
+
         Parameters
         ----------
         lower_m, upper_m : float
@@ -276,11 +278,6 @@ class Grid:
         -------
         FlatGrid
             A column is occupied if any voxel between the heights is, free if all are.
-
-        Raises
-        ------
-        ValueError
-            If the heights are not ascending, or no column of the grid shows ground.
         """
         ascending = number(lower_m, "lower_m") < number(upper_m, "upper_m")
         check(ascending, f"upper_m must be above lower_m, {lower_m}, not {upper_m}")

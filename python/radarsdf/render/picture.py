@@ -25,6 +25,8 @@ def render(
 ) -> Bytes:
     """Render a mesh on white, lit from behind the viewer, upper left.
 
+    Raises a ValueError if the mesh has no triangles, or the shape of the colours or of the viewpoint is wrong.
+
     Parameters
     ----------
     mesh : trimesh.Trimesh
@@ -41,11 +43,6 @@ def render(
     -------
     (height, width, 3) uint8
         Red, green and blue.
-
-    Raises
-    ------
-    ValueError
-        If the mesh has no triangles, or the shape of the colours or of the viewpoint is wrong.
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int32).reshape(-1, 3)

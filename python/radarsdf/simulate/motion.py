@@ -56,7 +56,7 @@ def measured_motion(
     Parameters
     ----------
     simulation : Simulation
-        F scans, at least two.
+        F scans, at least two, or a ValueError is raised.
     rate_hz : float
         Scan rate, Hz.
     interval_mps : float, optional
@@ -70,11 +70,6 @@ def measured_motion(
     -------
     MeasuredMotion
         The same arguments give the same result, bit by bit.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two scans.
 
     Examples
     --------
@@ -131,7 +126,7 @@ def measured_imu(
     poses : (F, 4, 4) array_like
         T_world_sensor, m, at least two, such as those of a simulation. z is up.
     times_s : (F,) array_like
-        Times of the poses, s, ascending.
+        Times of the poses, s, ascending, or a ValueError is raised, as for a single pose.
     rate_hz : float
         Measurement rate, Hz.
     R_sensor_imu : (3, 3) array_like, optional
@@ -145,11 +140,6 @@ def measured_imu(
     -------
     Imu
         Its `R_sensor_imu` is None. The same arguments give the same result, bit by bit.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two poses, or times differ in number or do not ascend.
 
     Examples
     --------
