@@ -51,12 +51,12 @@ def measured_motion(
     """Measure the motion along the smooth curve through the poses of a simulation.
 
     Doppler has a standard deviation of 0.1 m/s, and a tenth of the returns move on their own, with a standard deviation of
-    5 m/s. Each component of the gyroscope has a standard deviation of 0.005 rad/s.
+    5 m/s. Each component of the gyroscope has a standard deviation of 0.005 rad/s. Raises a ValueError for fewer than two scans.
 
     Parameters
     ----------
     simulation : Simulation
-        F scans, at least two, or a ValueError is raised.
+        F scans, at least two.
     rate_hz : float
         Scan rate, Hz.
     interval_mps : float, optional
@@ -120,13 +120,14 @@ def measured_imu(
     """Measure a motion by an IMU along the smooth curve through poses.
 
     Each component has a standard deviation of 0.005 rad/s and 0.05 m/s². The accelerometer has a bias of 0.02 to 0.04 m/s².
+    Raises a ValueError for fewer than two poses, and for times that differ in number or do not ascend.
 
     Parameters
     ----------
     poses : (F, 4, 4) array_like
         T_world_sensor, m, at least two, such as those of a simulation. z is up.
     times_s : (F,) array_like
-        Times of the poses, s, ascending, or a ValueError is raised, as for a single pose.
+        Times of the poses, s, ascending.
     rate_hz : float
         Measurement rate, Hz.
     R_sensor_imu : (3, 3) array_like, optional
