@@ -158,18 +158,26 @@ def test_a_guess_that_returns_do_not_confirm_is_not_sure(index, elsewhere):
         assert (np.sqrt(np.einsum("fii->fi", found.covariance)[:, :2]) >= 0.5).all()
 
 
-def test_a_kidnapped_radar_is_found_again(first, index):
-    early, late = (first_scans(another_day, FEW, first, 1, stretch=s) for s in ((0.0, 0.3), (0.7, 1.0)))
-    one, other = measured(early), measured(late)
+def kidnapped(first, index, begin, counts):
+    """A drive moved to the share `begin` of its path after the first of `counts` scans: as located, and true poses."""
+    parts = zip(counts, (0.0, begin), strict=True)
+    drives = [first_scans(another_day, count, first, 1, stretch=(s, s + 0.3)) for count, s in parts]
+    one, other = map(measured, drives)
     times_s = np.concatenate([one.times_s, one.times_s[-1] + 0.1 + other.times_s])
     speeds = one.doppler_mps + other.doppler_mps
     found = radarsdf.locate(index, one.points + other.points, doppler_mps=speeds, times_s=times_s)
-    true = np.concatenate([early.poses, late.poses])
-    known = found.segments >= 0
+    return found, np.concatenate([drive.poses for drive in drives])
+
+
+@pytest.mark.parametrize(("begin", "counts"), [(0.7, (FEW, FEW)), (0.173, (FEW, FEW)), (0.237, (15, 9))])
+def test_a_kidnapped_radar_is_found_again(first, index, begin, counts):
+    # After 12 scans by 43 and 1 m, after 15 by 2.5 m.
+    found, true = kidnapped(first, index, begin, counts)
+    known, early = found.segments >= 0, counts[0]
     assert errors(found.poses[known], true[known])[0].max() < 0.5
-    assert known[: len(early)].mean() > 0.8
-    assert known[len(early) :].mean() > 0.8
-    assert set(found.segments[len(early) :]) - set(found.segments[: len(early)])
+    assert known[:early].mean() > 0.8
+    assert known[early:].mean() > 0.8
+    assert not set(found.segments[early:][known[early:]]) & set(found.segments[:early][known[:early]])
 
 
 def test_sessions_are_joined_or_apart():

@@ -7,15 +7,17 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from radarsdf.arrays import ArrayLike, Floats, Ints
+from radarsdf.arrays import Array, ArrayLike, Floats, Ints
 from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.map import Map
+from radarsdf.poses.agreement import Gain
 from radarsdf.poses.checked_scans import checked_settings
+from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.odometry import check_observed, track_scans
 from radarsdf.poses.planes import PlaneMap, SensorReturns, Tracked, least_certain, plane_cell_m, thin
 from radarsdf.poses.refine import WEAK, JointEstimator
-from radarsdf.poses.rigid import covariance_in, increments, skew, transform
+from radarsdf.poses.rigid import between, covariance_in, increments, skew, transform
 from radarsdf.poses.search import SUBMAP_SCANS, Lost, SurfaceIndex, search_near, search_scans
 from radarsdf.poses.tracking import Drive
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -30,6 +32,12 @@ _FEWEST = 6  # scans to search
 # Least agreement of a part of the drive that is where it seems, relative to that found first. Of a part after a jump of 20 m, fitted to
 # other surfaces: 0.64; of others 0.8 to 1.
 _LEAST_AGREEING = 0.75
+_STILL = np.zeros(3)
+# Jump of a radar that is moved, with standard deviations of 2 m and 0.3 rad.
+_MOVED = PredictedStep(MotionRate(_STILL, np.diag([0, 0, 0.09])), _STILL, _STILL, np.diag([4.0, 4, 0]), 1.0)
+_NEAR, _COMPARED = 30, 500  # scans before and after a few that are compared elsewhere, and returns of a scan
+_BY_CHANCE = 1e-3  # significance level of a jump
+_SHARING = 3.0  # edge of the cells in which returns share errors of the map, surfel cells
 _PLACE_RAD = 0.1  # standard deviation of the rotation of a place that was found
 _HEIGHT_M = 2.0  # of its height, m: the search compares only the best height of each place
 _GUESS_SIGMAS = np.repeat([0.5, 0.05], 3)  # standard deviations of a guess, m and rad
@@ -132,15 +140,16 @@ def locate(
     while parts:
         part = parts.pop(0)
         try:
-            rows, *found = localiser.locate(part, start if part[0] == 0 else None)
+            rows, jumps, *found = localiser.locate(part, start if part[0] == 0 else None)
         except Lost as refused:
             why.append(refused)
             continue
-        poses[rows], covariance[rows], explained[rows] = found
-        poses[rows, :3, 3] += index.origin
-        segments[rows] = segments.max() + 1
-        # The others do not agree there: the radar may have been moved, or left the map.
-        others = part[part < rows[0]], part[part > rows[-1]]
+        if not jumps:
+            poses[rows], covariance[rows], explained[rows] = found
+            poses[rows, :3, 3] += index.origin
+            segments[rows] = segments.max() + 1
+            # The others do not agree there: the radar may have been moved, or left the map.
+        others = np.split(part, jumps) if jumps else [part[part < rows[0]], part[part > rows[-1]]]
         parts = [*(rest for rest in others if len(rest) >= _FEWEST), *parts]
     if segments.max() < 0:
         raise why[0]
@@ -174,17 +183,20 @@ class _Localiser:
     config: FitConfig
     notes: list[str]
 
-    def locate(self, rows: Ints, guess: Floats | None) -> tuple[Ints, Floats, Floats, Floats]:
-        """Return those of the scans `rows` (K,) of a segment that are found together, with poses, covariances and explained shares."""
-        poses = np.stack([self.tracked[i].pose for i in rows])
+    def locate(self, part: Ints, guess: Floats | None) -> tuple[Ints, list[int], Floats, Floats, Floats]:
+        """Return those of the scans `part` (K,) of a segment that are found together, with poses, covariances and explained shares.
+
+        Second is where to split the part, if the radar was moved in it.
+        """
+        rows, own = part, np.stack([self.tracked[i].pose for i in part])
         rig = None if self.drive.rig is None else self.drive.rig.select(rows)
         limits, scans = self.config.returns, [self.drive.scans[i] for i in rows]
         returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m, rig)
         if len(returns) == 0:
             msg = "the scans have no returns"
             raise Lost(msg)
-        poses, submap, first, undecided = self._place(returns, poses, guess)
-        thinned = [thin(scan) for scan in scans]
+        poses, submap, first, undecided = self._place(returns, own, guess)
+        thinned = every = [thin(scan) for scan in scans]
         reach_m = float(np.percentile(returns.ranges_m, 99))
         planes = self.index.near(poses[:, :3, 3], 1.5 * reach_m)
         rays = returns.posed(poses)
@@ -195,9 +207,9 @@ class _Localiser:
         rows, poses, thinned = rows[kept], poses[kept], thinned[kept]
         scans, rig = scans[kept], None if rig is None else rig.select(kept)
         # The horizontal place is known to the capture range of the planes: nothing is alike farther away.
-        row = (submap.start + submap.stop) // 2 - kept.start
+        row = min(max((submap.start + submap.stop) // 2 - kept.start, 0), len(rows) - 1)
         near = row, poses[row], np.array([planes.capture_m] * 2 + [_HEIGHT_M] + [_PLACE_RAD] * 3)
-        if first is not None:
+        if first is not None and kept.start == 0:
             near = 0, first, _GUESS_SIGMAS
         anchor = self._anchor(noise, thinned, poses, 1.5 * reach_m, near)
         if len(rows) < 2:
@@ -211,11 +223,14 @@ class _Localiser:
             estimator = JointEstimator(returns, motions, cell_m, self.config)
             found = estimator.estimate(poses, anchor=anchor)
             poses, covariance = found.poses, found.covariance
+        jumps, doubt = self._jumps(planes, every, poses, kept, own)
+        covariance = covariance + doubt[kept]
         if undecided:  # poses are as uncertain as the guess of the first one
             J = np.tile(np.eye(6), (len(poses), 1, 1))
             J[:, :3, 3:] = -skew(poses[:, :3, 3] - poses[0, :3, 3])
             covariance = covariance + np.einsum("fij,j,fkj->fik", J, _GUESS_SIGMAS**2, J)
-        return rows, poses, covariance, anchor.agreeing(poses) / [max(len(scan), 1) for scan in thinned]
+        explained = anchor.agreeing(poses) / [max(len(scan), 1) for scan in thinned]
+        return rows, jumps, poses, covariance, explained
 
     def _place(
         self, returns: SensorReturns, poses: Floats, guess: Floats | None
@@ -253,8 +268,7 @@ class _Localiser:
             for part in order:
                 own = poses[part[len(part) // 2]]
                 back = np.linalg.inv(own)
-                near = [scans[i] @ (back @ poses[i])[:3, :3].T + (back @ poses[i])[:3, 3] for i in part]
-                points, mean = thin(np.concatenate(near)), correction @ own
+                points, mean = thin(_posed([scans[i] for i in part], back @ poses[part])), correction @ own
                 registered = planes.discount_chance(points, prior, planes.fit(points, mean, prior))
                 # Along the least certain axis, a step by chance is discounted as its information is.
                 axis, pose = least_certain(registered.covariance), registered.pose.copy()
@@ -271,6 +285,58 @@ class _Localiser:
                 prior = registered.covariance + covariance_in(drift, pose[:3, :3])
         return found, slice(ends[1], ends[0] + 1)
 
+    def _jumps(
+        self, planes: PlaneMap, scans: list[Floats], poses: Floats, kept: slice, own: Floats
+    ) -> tuple[list[int], Floats]:
+        """Test whether successive ones of K scans, tracked at `own` (K, 4, 4), agree better elsewhere: whether the radar was moved.
+
+        `poses` are those of the scans `kept`. Returns where to split, and covariances (K, 6, 6) due to a doubtful jump.
+        """
+        count, half, capture_m = len(own), SUBMAP_SCANS // 2, planes.capture_m
+        nearest = np.clip(np.arange(count), kept.start, kept.stop - 1)
+        poses = poses[nearest - kept.start] @ between(own[nearest], own)
+        scans = [thin(scan, _COMPARED) for scan in scans]
+        numbers = np.repeat(np.arange(count), [len(scan) for scan in scans])
+        # Returns in one cell share the errors of the map, and those outside of it tell nothing.
+        points = _posed(scans, poses)
+        shown = self.index.outlines(points, capture_m)
+        cells = np.floor(points / (_SHARING * self.index.cell_m))
+        cells = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+        radius_m = float(np.median(np.linalg.norm(np.concatenate(scans), axis=1)))
+        moves = _MOVED.candidates(capture_m, radius_m)[1]
+        prior = np.diag(np.repeat([capture_m, capture_m / radius_m], 3) ** 2)
+        scores, begins = _scores(planes, scans, poses), range(0, count, half)
+        most, first, last, gains, others = 0.0, 0, 0, np.zeros(len(numbers)), poses
+        for begin in begins:
+            middle = min(begin + half // 2, count - 1)
+            window, near = slice(begin, begin + half), slice(max(begin - _NEAR, 0), begin + _NEAR)
+            points = thin(_posed(scans[window], np.linalg.inv(poses[middle]) @ poses[window]))
+            if len(points) == 0:
+                continue
+            tried, there = np.ascontiguousarray(poses[middle] @ moves), poses.copy()
+            agreeing = planes.coarse.scores(thin(points, _COMPARED), tried, planes.variances).mean(axis=1)
+            other = planes.fit(points, tried[agreeing.argmax()], prior).pose
+            there[near] = other @ between(own[[middle]], own[near])
+            low, high = np.searchsorted(numbers, [near.start, near.stop])
+            gained = np.zeros(len(numbers))
+            gained[low:high] = _scores(planes, scans[near], there[near]) - scores[low:high]
+            gained *= shown
+            total, *run = _largest_sum(np.bincount(numbers, gained, count))
+            if total > most:
+                most, (first, last), gains, others = total, run, gained, there
+
+        def clear(begin: int, end: int, gains: Floats, tests: float = 1.0) -> bool:
+            of = shown & (numbers >= begin) & (numbers < end)
+            return bool(of.any() and Gain.by_groups(gains[of], cells[of]).excess(_BY_CHANCE / tests) > 1)
+
+        tests = len(begins) * count * (count + 1) / 2
+        off = np.zeros((count, 6))
+        off[first:last] = clear(first, last, gains) * increments(poses[first:last], others[first:last])
+        sides = ((first, 0, first), (last, last, count)) if clear(first, last, gains, tests) else ()
+        jumps = [k for k, one, end in sides if 0 < k < count and clear(one, end, -gains, tests)]
+        # The scans next to a jump may agree with neither side.
+        return [k + d for k in jumps for d in (-1, 1)], np.einsum("fi,fj->fij", off, off)
+
     def _anchor(
         self, noise: SensorNoise, scans: list[Floats], poses: Floats, reach_m: float, near: _Near
     ) -> "_Anchor":
@@ -284,7 +350,7 @@ class _Localiser:
             _, nearest = self.index.tree.query(rays + pose[:3, 3], workers=workers)
             seen = np.einsum("ni,ni->n", rays, self.index.surface.normals[nearest]) < 0
             facing.append(np.ascontiguousarray(scan[seen]))
-            cells.append(np.floor((rays[seen] + pose[:3, 3]) / (3 * self.index.cell_m)))
+            cells.append(np.floor((rays[seen] + pose[:3, 3]) / (_SHARING * self.index.cell_m)))
         number = sum(map(len, facing))
         alike = number / max(len(np.unique(np.concatenate(cells), axis=0)), 1)
         ranges_m = np.linalg.norm(np.concatenate(facing), axis=1).astype(np.float32)
@@ -320,3 +386,22 @@ class _Anchor:
         """Return the number (F,) of returns of each scan that agree with the planes."""
         each = zip(self.scans, poses, strict=True)
         return np.array([self.planes.normal_equations(scan, pose)[2] for scan, pose in each])
+
+
+def _posed(scans: Sequence[Floats], poses: Floats) -> Floats:
+    """Return the returns (N, 3) of scans (N_i, 3) at poses (F, 4, 4)."""
+    return np.concatenate([scan @ T[:3, :3].T + T[:3, 3] for scan, T in zip(scans, poses, strict=True)])
+
+
+def _scores(planes: PlaneMap, scans: Sequence[Floats], poses: Floats) -> Floats:
+    """Return the agreement (N,) of the returns of scans (N_i, 3) at poses (F, 4, 4), in [0, 1]."""
+    each = zip(scans, poses[:, None], strict=True)
+    return np.concatenate([planes.fine.scores(scan, T, planes.variances)[0] for scan, T in each])
+
+
+def _largest_sum(values: Array) -> tuple[float, int, int]:
+    """Return the largest sum of successive values (K,), the first of them, and the end."""
+    sums = np.append(0.0, np.cumsum(values))
+    rises = sums - np.minimum.accumulate(sums)
+    end = int(rises.argmax())
+    return float(rises[end]), int(sums[: end + 1].argmin()), end
