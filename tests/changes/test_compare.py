@@ -14,7 +14,7 @@ from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
-from scenes.revisits import another_day
+from scenes.revisits import SYMMETRIC, another_day
 
 from .conftest import QUICK, drives_past
 
@@ -97,6 +97,14 @@ def test_maps_of_unrelated_frames_are_compared():
     np.testing.assert_allclose((found.T_before_after @ apart)[:3, :3], np.eye(3), atol=0.01)
     moved_m = (found.T_before_after @ apart @ day.poses - day.poses)[:, :3, 3]
     np.testing.assert_allclose(moved_m, 0, atol=0.05)
+
+
+@pytest.mark.parametrize("name", list(SYMMETRIC))
+def test_another_place_that_fits_is_named(name):
+    first = SYMMETRIC[name](seed=2, frames=30)
+    before, day = radarsdf.fit(first.points, first.poses, config=QUICK), another_day(first, 2)
+    words = radarsdf.compare(before, day.points, day.poses).report["alignment"]
+    assert "two places of the map fit about equally well" in words
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """Registration of two maps by their surfaces."""
 
-import contextlib
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -65,13 +64,17 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     def nearer(first: Floats, second: Floats) -> bool:
         return Verdict.by_groups(far(first) - far(second), surface.patches).improved
 
-    own, T_near = surface, np.eye(4)
+    own, T_near, assumed = surface, np.eye(4), ""
     found = _constrained_pose(before, surface, np.eye(4))
     searched = _constrained_pose(before, surface, _coarse_pose(before, surface))
     if nearer(found[0], searched[0]):
         found = searched
-    with contextlib.suppress(Lost):
+    try:
         place = _place(before, after)
+    except Lost as lost:
+        if len(lost.places) > 1:
+            assumed = f" Assumed: the offset is small; {lost}."
+    else:
         points, normals = transformed(surface.points, place), turned(surface.normals, place[:3, :3])
         near = replace(surface, points=points, normals=normals, centre=points.mean(axis=0))
         searched = _constrained_pose(before, near, np.eye(4))
@@ -83,14 +86,14 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     by_chance = np.sqrt(chi2.isf(_SIGNIFICANCE, len(offset)))
     if (own is surface and sigmas <= by_chance) or far(pose).mean() >= far(np.eye(4)).mean():
         words = "The frames were taken as they are: surfaces do not show an offset between them."
-        return Alignment(covariance=covariance, centre=own.centre, words=words)
+        return Alignment(covariance=covariance, centre=own.centre, words=words + assumed)
     moved_m = np.sqrt(((transformed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
     how = f"{sigmas:.1f} standard errors" if own is surface else "to the only place where it fits"
     words = (
         f"The later map was moved by {moved_m:.3f} m, {how}; "
         f"surfaces do not determine {undetermined} of 6 axes, along which its pose was kept."
     )
-    return Alignment(pose, covariance, own.centre + offset[:3], words)
+    return Alignment(pose, covariance, own.centre + offset[:3], words + assumed)
 
 
 @dataclass(frozen=True)
