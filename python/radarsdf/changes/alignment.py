@@ -72,8 +72,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     try:
         place = _place(before, after)
     except Lost as lost:
-        if len(lost.places) > 1:
-            assumed = f" Assumed: the offset is small; {lost}."
+        assumed = f" Assumed: the offset is small; {lost}." if len(lost.places) > 1 else ""
     else:
         points, normals = transformed(surface.points, place), turned(surface.normals, place[:3, :3])
         near = replace(surface, points=points, normals=normals, centre=points.mean(axis=0))

@@ -530,8 +530,8 @@ class LiveMap:
             time_s, latest = checks.number(time_s, "time_s"), checks.MAX_TIME_S
             check(abs(time_s) <= latest, f"time_s must be finite and within {latest:g} s, not {time_s:g}")
         values_of_scan = None if values is None else values[0].copy()
-        stated = None if sigmas is None else checks.real_array(sigmas, "sigmas", np.float32).copy()
-        if stated is not None:
-            checks.check_values_of_scan(stated, scan, "sigmas", 0, 3)
-        held = compact(scan), values_of_scan, speeds, stated, static
+        each = (
+            [] if sigmas is None else checks.values_of_scans([sigmas], scans, "sigmas", checks.real_array, 3)
+        )
+        held = compact(scan), values_of_scan, speeds, compact(each[0].copy()) if each else None, static
         return LoggedScan(np.eye(4), *held, time_s), left_out.far

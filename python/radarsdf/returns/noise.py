@@ -197,17 +197,15 @@ def _residuals(surfels: Surfels, rays: Rays, num_threads: int) -> tuple[Floats, 
 
 
 def without_false_deviations(rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_threads: int) -> Rays:
-    """Leave out the stated deviations of radars that are not :func:`credible_deviations`."""
+    """Leave out the stated deviations of radars that are not credible."""
     if rays.stated is None:
         return rays
-    credible = credible_deviations(rays, leaf_size_m, config, num_threads)
+    credible = are_credible(rays, leaf_size_m, config, num_threads)
     known = [np.ones(3) if told else np.full(3, np.nan) for told in credible]
     return rays.with_relative_deviations(known) if any(credible) else replace(rays, stated=None)
 
 
-def credible_deviations(
-    rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_threads: int
-) -> list[bool]:
+def are_credible(rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_threads: int) -> list[bool]:
     """Return whether the stated deviations of each radar, as weights, make the mean of its returns no less precise."""
     surfels, credible = Surfels.of(rays, leaf_size_m, num_threads), []
     for rows in rays.rows_of_sensors():

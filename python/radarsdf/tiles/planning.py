@@ -25,19 +25,12 @@ from radarsdf.returns.noise import (
     NOISE_SETTINGS,
     RigNoise,
     SensorNoise,
-    credible_deviations,
+    are_credible,
     rig_noise,
     sensor_noise,
 )
 from radarsdf.returns.planes import Surfels
-from radarsdf.returns.rays import (
-    LeftOut,
-    Rays,
-    check_range,
-    median_deviations,
-    middle_scan,
-    rays_from,
-)
+from radarsdf.returns.rays import LeftOut, Rays, check_range, median_deviations, middle_scan, rays_from
 from radarsdf.returns.sensor import SAME_UNIT, Sensor, Unit, in_map_unit, intensity_units
 from radarsdf.returns.sums import lattice_of
 from radarsdf.rig import Label
@@ -48,8 +41,6 @@ _LOG = logging.getLogger("radarsdf.tiles")
 SCANS_FILE = "scans.npy"
 _RECORD = [("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")]
 """A return in the frame of its tile, m; index of its scan; its intensity, sensor units, NaN if there are none."""
-# Then, if sensors state any, its deviations of range, azimuth and elevation, m, rad, rad, NaN where unknown.
-_STATED = ("stated", "<f4", (3,))
 _CHUNK_SCANS = 256  # scans in memory at a time
 _CHUNK_RETURNS = 500_000  # returns in memory at a time: fewer scans of a dense sensor
 _CHUNK_M = 1000.0  # scans of a chunk share a local frame, in which float32 must be precise
@@ -134,8 +125,7 @@ class Planner:
         together = self._config.returns.accumulate_scans
         seen_from = [middle_scan(i, len(scans), together) for i in range(len(scans))]
         self._axes.append(np.concatenate([poses[seen_from, :3, 3], poses[:, :3, 2], radars[:, None]], axis=1))
-        if self._record is None:
-            self._record = record_of(rays.stated is not None)
+        self._record = self._record or record_of(rays.stated is not None)
         if len(rays) == 0:
             return
         if rays.intensities is not None:
@@ -282,11 +272,12 @@ class Planner:
         if not plan.with_deviations:
             return plan
         rays, _ = read_rays(self._folder, plan, max(plan.tiles, key=attrgetter("returns")))
-        settings = plan.config.leaf_size_m, plan.config.returns, plan.config.num_threads
-        credible = credible_deviations(rays, *settings)
-        false = [dataclasses.replace(radar, median_deviations=None) for radar in plan.radars]
-        each = zip(credible, plan.radars, false, strict=True)
-        return dataclasses.replace(plan, radars=tuple(own if told else other for told, own, other in each))
+        credible = are_credible(rays, plan.config.leaf_size_m, plan.config.returns, plan.config.num_threads)
+        false = (dataclasses.replace(radar, median_deviations=None) for radar in plan.radars)
+        radars = (
+            own if told else other for own, other, told in zip(plan.radars, false, credible, strict=True)
+        )
+        return dataclasses.replace(plan, radars=tuple(radars))
 
     def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
         """Estimate a sensor without noise from the samples of radars, with the intensities in one unit."""
@@ -298,7 +289,8 @@ class Planner:
 
 
 def record_of(with_deviations: bool) -> np.dtype[np.void]:
-    return np.dtype([*_RECORD, _STATED] if with_deviations else _RECORD)
+    """Return the type of a return in the files, with the deviations that its sensor states, m, rad, rad, NaN where unknown."""
+    return np.dtype([*_RECORD, ("stated", "<f4", (3,))] if with_deviations else _RECORD)
 
 
 def rays_path(folder: Path, tile: Tile) -> Path:
