@@ -83,10 +83,7 @@ def test_the_noise_of_radars_that_take_turns_is_that_of_each(scans, monkeypatch)
     ("kind", "seed", "count", "apart_s"), [("yard", 0, 90, 0.0), ("forest", 1, 200, 0.017)]
 )
 def test_the_body_is_tracked_by_radars_whose_scans_are_close(kind, seed, count, apart_s):
-    """Regressions: from 8 scans 0.4 m apart, narrow radars seemed to contradict right Doppler: two thirds were lost.
-
-    And differences of their maps were taken for turns between them: pitch had errors of 15 degrees.
-    """
+    """Narrow radars seemed to contradict right Doppler from 8 scans, and differences of their maps were taken for turns in pitch."""
     scans = three_at_20_hz(KINDS[kind](seed=seed), count // 6 + 3, apart_s)
     live = LiveMap(T_body_sensor=scans.T_body_sensor)
     for i in range(count):
@@ -160,8 +157,7 @@ def test_cells_with_very_many_returns_keep_their_mean():
         ScanSums.of(prepare([[[0.19, 0.01, 0.1]]], [np.eye(4)], origin=[0, 0, 0]), 0.2),
     )
     many = corner.sums * WEIGHT_UNIT * 10_000_000
-    blocks = corner.keys >> BLOCK_BITS
-    columns = corner.keys, many, np.ones(1, np.uint32), blocks, np.ones(1, np.uint32)
+    columns = corner.keys, many, np.ones(1, np.uint32), corner.keys >> BLOCK_BITS, np.ones(1, np.uint32)
     at_once(*sums.insert([columns, columns]))
     noises = SensorNoise(0.1, 0.01, 0.01), SensorNoise(0.05, 0.005, 0.005)
     found = sums.weighted(0.2, RigNoise(*noises[0].deviations, noises, (26, 102)))

@@ -45,10 +45,7 @@ def position_error_m(poses, true):
 
 
 def first(drive, count, *given, **named):
-    """First scans of a drive. A shorter drive of the same kind would have longer steps on the same trajectory.
-
-    `drive` is a function of `radarsdf.simulate`. Scans that are not used are not simulated.
-    """
+    """Simulate only the first scans of a `drive` of `radarsdf.simulate`: a shorter one would have longer steps on the same path."""
     scan = RadarSensor.scan
     nothing = SimulatedScan(np.zeros((0, 3), np.float32), *np.zeros((3, 0), np.float32))
 

@@ -169,9 +169,11 @@ def kidnapped(first, index, begin, counts):
     return found, np.concatenate([drive.poses for drive in drives])
 
 
-@pytest.mark.parametrize(("begin", "counts"), [(0.7, (FEW, FEW)), (0.173, (FEW, FEW)), (0.237, (15, 9))])
+@pytest.mark.parametrize(
+    ("begin", "counts"), [(0.7, (FEW, FEW)), (0.173, (FEW, FEW)), (0.237, (15, 9)), (0.3, (8, 16))]
+)
 def test_a_kidnapped_radar_is_found_again(first, index, begin, counts):
-    # After 12 scans by 43 and 1 m, after 15 by 2.5 m.
+    # After 12 scans by 43 and 1 m, after 15 by 2.5 m, after 8 by 12 m.
     found, true = kidnapped(first, index, begin, counts)
     known, early = found.segments >= 0, counts[0]
     assert errors(found.poses[known], true[known])[0].max() < 0.5

@@ -1,8 +1,9 @@
 """Localisation of scans in a map made before."""
 
+import itertools
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -135,8 +136,8 @@ def locate(
     explained, segments = np.full(count, np.nan), np.full(count, -1)
     why: list[Lost] = []
     localiser = _Localiser(index, drive, tracked, config, checked.notes)
-    of_scans = np.array([found.segment for found in tracked])
-    parts = [np.flatnonzero(of_scans == segment) for segment in range(of_scans[-1] + 1)]
+    followed = np.array([found.segment for found in tracked])
+    parts = [np.flatnonzero(followed == segment) for segment in range(followed[-1] + 1)]
     while parts:
         part = parts.pop(0)
         try:
@@ -146,13 +147,16 @@ def locate(
             continue
         if not jumps:
             poses[rows], covariance[rows], explained[rows] = found
-            poses[rows, :3, 3] += index.origin
             segments[rows] = segments.max() + 1
             # The others do not agree there: the radar may have been moved, or left the map.
         others = np.split(part, jumps) if jumps else [part[part < rows[0]], part[part > rows[-1]]]
         parts = [*(rest for rest in others if len(rest) >= _FEWEST), *parts]
     if segments.max() < 0:
         raise why[0]
+    localiser.leave_moved(poses, segments)
+    for of_scans in (poses, covariance, explained):
+        of_scans[segments < 0] = np.nan
+    poses[:, :3, 3] += index.origin
     report = {
         "verdict": _summarize(segments, explained),
         "found": int((segments >= 0).sum()),
@@ -182,12 +186,10 @@ class _Localiser:
     tracked: list[Tracked]
     config: FitConfig
     notes: list[str]
+    noises: list[SensorNoise] = field(default_factory=list)  # of each segment
 
     def locate(self, part: Ints, guess: Floats | None) -> tuple[Ints, list[int], Floats, Floats, Floats]:
-        """Return those of the scans `part` (K,) of a segment that are found together, with poses, covariances and explained shares.
-
-        Second is where to split the part, if the radar was moved in it.
-        """
+        """Return those of the scans `part` (K,) that are found together, where to split it, poses, covariances and explained shares."""
         rows, own = part, np.stack([self.tracked[i].pose for i in part])
         rig = None if self.drive.rig is None else self.drive.rig.select(rows)
         limits, scans = self.config.returns, [self.drive.scans[i] for i in rows]
@@ -203,6 +205,7 @@ class _Localiser:
         surfels = Surfels.of(rays, self.index.cell_m / LEAVES_PER_SURFEL, self.config.num_threads)
         noise = sensor_noise(surfels, rays, limits, self.config.num_threads)
         planes.variances = noise.variances
+        self.noises.append(noise)
         poses, kept = self._follow(planes, thinned, poses, rows, submap)
         rows, poses, thinned = rows[kept], poses[kept], thinned[kept]
         scans, rig = scans[kept], None if rig is None else rig.select(kept)
@@ -297,11 +300,8 @@ class _Localiser:
         poses = poses[nearest - kept.start] @ between(own[nearest], own)
         scans = [thin(scan, _COMPARED) for scan in scans]
         numbers = np.repeat(np.arange(count), [len(scan) for scan in scans])
-        # Returns in one cell share the errors of the map, and those outside of it tell nothing.
-        points = _posed(scans, poses)
-        shown = self.index.outlines(points, capture_m)
-        cells = np.floor(points / (_SHARING * self.index.cell_m))
-        cells = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+        returns = _posed(scans, poses)
+        shown = self.index.outlines(returns, capture_m)  # outside of the map, they tell nothing
         radius_m = float(np.median(np.linalg.norm(np.concatenate(scans), axis=1)))
         moves = _MOVED.candidates(capture_m, radius_m)[1]
         prior = np.diag(np.repeat([capture_m, capture_m / radius_m], 3) ** 2)
@@ -327,15 +327,40 @@ class _Localiser:
 
         def clear(begin: int, end: int, gains: Floats, tests: float = 1.0) -> bool:
             of = shown & (numbers >= begin) & (numbers < end)
-            return bool(of.any() and Gain.by_groups(gains[of], cells[of]).excess(_BY_CHANCE / tests) > 1)
+            return bool(of.any() and self._gain(gains[of], returns[of]).excess(_BY_CHANCE / tests) > 1)
 
         tests = len(begins) * count * (count + 1) / 2
         off = np.zeros((count, 6))
         off[first:last] = clear(first, last, gains) * increments(poses[first:last], others[first:last])
         sides = ((first, 0, first), (last, last, count)) if clear(first, last, gains, tests) else ()
         jumps = [k for k, one, end in sides if 0 < k < count and clear(one, end, -gains, tests)]
-        # The scans next to a jump may agree with neither side.
-        return [k + d for k in jumps for d in (-1, 1)], np.einsum("fi,fj->fij", off, off)
+        return jumps, np.einsum("fi,fj->fij", off, off)
+
+    def leave_moved(self, poses: Floats, segments: Ints) -> None:
+        """Set segments to -1 of scans next to a jump that agree better with the map as tracked from its other side."""
+        reach_m = 1.5 * float(np.percentile(np.linalg.norm(np.concatenate(self.drive.scans), axis=1), 99))
+        pairs = [*itertools.pairwise(np.flatnonzero(segments >= 0))]
+        for end, other in [*pairs, *(pair[::-1] for pair in pairs)]:
+            if segments[end] == segments[other] or self.tracked[end].segment != self.tracked[other].segment:
+                continue
+            own = np.flatnonzero(segments == segments[end])
+            rows = own[np.argsort(abs(own - end))][:SUBMAP_SCANS]  # nearest to the jump first
+            scans, tracked = ([of[i] for i in rows] for of in (self.drive.scans, self.tracked))
+            T_map_own = poses[other] @ np.linalg.inv(self.tracked[other].pose)
+            there = T_map_own @ np.stack([found.pose for found in tracked])
+            planes = self.index.near(poses[rows, :3, 3], reach_m)
+            planes.variances = self.noises[-1].variances
+            gains = _scores(planes, scans, there) - _scores(planes, scans, poses[rows])
+            ends = np.cumsum([len(scan) for scan in scans])
+            last = int(np.cumsum(gains)[ends - 1].argmax())
+            returns = _posed(scans, poses[rows])[: ends[last]]
+            if self._gain(gains[: len(returns)], returns).excess(_BY_CHANCE / len(rows)) > 1:
+                segments[rows[: last + 1]] = -1
+
+    def _gain(self, gains: Floats, returns: Floats) -> Gain:
+        """Return the mean of gains (N,) of returns (N, 3). In one cell, these share the errors of the map."""
+        cells = np.floor(returns / (_SHARING * self.index.cell_m))
+        return Gain.by_groups(gains, np.unique(cells, axis=0, return_inverse=True)[1].ravel())
 
     def _anchor(
         self, noise: SensorNoise, scans: list[Floats], poses: Floats, reach_m: float, near: _Near
