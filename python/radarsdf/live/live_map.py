@@ -530,8 +530,9 @@ class LiveMap:
             time_s, latest = checks.number(time_s, "time_s"), checks.MAX_TIME_S
             check(abs(time_s) <= latest, f"time_s must be finite and within {latest:g} s, not {time_s:g}")
         values_of_scan = None if values is None else values[0].copy()
-        each = (
-            [] if sigmas is None else checks.values_of_scans([sigmas], scans, "sigmas", checks.real_array, 3)
-        )
-        held = compact(scan), values_of_scan, speeds, compact(each[0].copy()) if each else None, static
+        stated = None
+        if sigmas is not None:
+            (stated,) = checks.values_of_scans([sigmas], scans, "sigmas", checks.real_array, 3)
+            stated = compact(stated.copy())
+        held = compact(scan), values_of_scan, speeds, stated, static
         return LoggedScan(np.eye(4), *held, time_s), left_out.far

@@ -32,9 +32,8 @@ from radarsdf.threads import resolve_num_threads
 
 _Scans = dict[ScanId, LoggedScan]
 _SAVED = ("noise", "noise_of", "next_id", "with_intensities")  # attributes saved as they are
-_USUAL = SensorNoise(
-    0.1, 0.01, 0.01
-)  # until it is estimated from scans, and for weights that depend on a scan alone
+# Until the noise is estimated from scans, and for weights that depend on a scan alone.
+_USUAL = SensorNoise(0.1, 0.01, 0.01)
 _NOISE_RETURNS = 100_000  # sample for the noise, enough to include the required returns on flat surfels
 # Rays of a fit, for free space and intensities, which take 100 bytes each: surfaces are those of the sums of all.
 _FIT_RETURNS = 4_000_000

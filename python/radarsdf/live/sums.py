@@ -16,7 +16,7 @@ _MOST_RETURNS = 2**16  # in a cell, of a radar of a rig
 
 
 class RadarSums:
-    """Sums in cells, in parts of 1 / `WEIGHT_UNIT`, and visibility counts of blocks, of K radars. Changes are calls for :func:`at_once`, K each."""
+    """Sums in cells, in parts of 1 / `WEIGHT_UNIT`, and visibility counts, of K radars. Changes are calls for :func:`at_once`, K each."""
 
     def __init__(self, num_radars: int) -> None:
         self._tables = [GrowingSums() for _ in range(num_radars)]

@@ -153,7 +153,7 @@ def locate(
         parts = [*(rest for rest in others if len(rest) >= _FEWEST), *parts]
     if segments.max() < 0:
         raise why[0]
-    localiser.leave_moved(poses, segments)
+    localiser.lose_moved(poses, segments)
     for of_scans in (poses, covariance, explained):
         of_scans[segments < 0] = np.nan
     poses[:, :3, 3] += index.origin
@@ -336,7 +336,7 @@ class _Localiser:
         jumps = [k for k, one, end in sides if 0 < k < count and clear(one, end, -gains, tests)]
         return jumps, np.einsum("fi,fj->fij", off, off)
 
-    def leave_moved(self, poses: Floats, segments: Ints) -> None:
+    def lose_moved(self, poses: Floats, segments: Ints) -> None:
         """Set segments to -1 of scans next to a jump that agree better with the map as tracked from its other side."""
         reach_m = 1.5 * float(np.percentile(np.linalg.norm(np.concatenate(self.drive.scans), axis=1), 99))
         pairs = [*itertools.pairwise(np.flatnonzero(segments >= 0))]

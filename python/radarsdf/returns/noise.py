@@ -201,8 +201,8 @@ def without_false_deviations(rays: Rays, leaf_size_m: float, config: ReturnsConf
     if rays.stated is None:
         return rays
     credible = are_credible(rays, leaf_size_m, config, num_threads)
-    known = [np.ones(3) if told else np.full(3, np.nan) for told in credible]
-    return rays.with_relative_deviations(known) if any(credible) else replace(rays, stated=None)
+    medians = [np.ones(3) if known else np.full(3, np.nan) for known in credible]
+    return rays.with_relative_deviations(medians) if any(credible) else replace(rays, stated=None)
 
 
 def are_credible(rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_threads: int) -> list[bool]:
@@ -218,7 +218,7 @@ def are_credible(rays: Rays, leaf_size_m: float, config: ReturnsConfig, num_thre
         credible.append(bool(means_m2[0] <= means_m2[1]))
     if not all(credible):
         _LOG.warning(
-            "Left out: deviations stated by the sensor. Returns of equal weight have a more precise mean."
+            "Left out: deviations stated by the sensor. The mean with equal weights is more precise."
         )
     return credible
 

@@ -273,10 +273,8 @@ class Planner:
             return plan
         rays, _ = read_rays(self._folder, plan, max(plan.tiles, key=attrgetter("returns")))
         credible = are_credible(rays, plan.config.leaf_size_m, plan.config.returns, plan.config.num_threads)
-        false = (dataclasses.replace(radar, median_deviations=None) for radar in plan.radars)
-        radars = (
-            own if told else other for own, other, told in zip(plan.radars, false, credible, strict=True)
-        )
+        each = zip(plan.radars, credible, strict=True)
+        radars = (own if true else dataclasses.replace(own, median_deviations=None) for own, true in each)
         return dataclasses.replace(plan, radars=tuple(radars))
 
     def _sensor(self, radars: Iterable[tuple[_Returns, Unit]]) -> Sensor:
